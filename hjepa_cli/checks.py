@@ -1,0 +1,122 @@
+"""Rules that settings must meet before anything is read, written or imported.
+
+``settings.py`` checks types and names; here are the values. Every message names the setting, what
+it is and what it may be, whether it came from a flag or a file.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from hjepa_cli.errors import UsageError
+from hjepa_cli.settings import Settings
+
+# Spec §8: every method `eval` and `scale` may be asked for; those without a model are skipped.
+METHODS = (
+    "hjepa",
+    "ts-jepa-1",
+    "ts-jepa-2",
+    "ts-jepa-3",
+    "ts-jepa-4",
+    "ts-jepa-5",
+    "supervised-2",
+    "supervised-4",
+    "autoencoder-2",
+    "hold",
+    "zero",
+    "hold-true",
+    "zero-true",
+    "optimal",
+    "oracle",
+    "linear",
+    "state-kf",
+    "state-48",
+    "local",
+)
+
+LARGEST_SEED = 2**63 - 1
+ZERO_ALLOWED = ("seed",)  # counts that may be 0; all others start at 1
+NEGATIVE_ALLOWED = ("encoder.gate_",)  # an R² threshold may be negative
+POSITIVE = ("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket")
+BELOW_ONE = ("actor.dropout", "encoder.ema_decay", "protocol.plant_spread", "protocol.bracket")
+
+
+def check_settings(settings: Settings) -> None:
+    """Check every value that has a rule.
+
+    Raises:
+        UsageError: naming the first setting that breaks one, and its valid values.
+    """
+    for key, value in _numbers(settings.as_dict()):
+        _check_number(key, value)
+    if settings.seed > LARGEST_SEED:
+        raise UsageError(f"seed = {settings.seed}; expected at most {LARGEST_SEED}")
+    check_strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
+    check_methods(settings.methods)
+    gaps = settings.protocol.gaps
+    if not gaps or list(gaps) != sorted(set(gaps)):
+        raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps, at least one")
+
+
+def check_strides(h: int, m: int, l: int) -> None:  # noqa: E741 - the paper's symbol
+    """Check that the strides of the three levels nest: h a multiple of m, m a multiple of l.
+
+    Raises:
+        UsageError: naming the strides that would do.
+    """
+    if h < 1:
+        raise UsageError(f"--h {h}; expected at least 1")
+    fitting_m = _largest_divisor(h, m)
+    fitting_l = _largest_divisor(fitting_m, l)
+    hint = f"hjepa train-hierarchy --h {h} --m {fitting_m} --l {fitting_l}"
+    for name, value, outer_name, outer in (("m", m, "h", h), ("l", l, "m", m)):
+        if value < 1 or outer % value:
+            choices = ", ".join(str(divisor) for divisor in _divisors(outer))
+            raise UsageError(
+                f"--{name} {value} does not divide --{outer_name} {outer}; "
+                f"choose --{name} from {choices}",
+                hint=hint,
+            )
+
+
+def check_methods(methods: tuple[str, ...]) -> None:
+    """Check method names.
+
+    Raises:
+        UsageError: no name, or a name that no method has.
+    """
+    if not methods:
+        raise UsageError(f"no method given; choose from {', '.join(METHODS)}")
+    for method in methods:
+        if method not in METHODS:
+            raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
+
+
+def _check_number(key: str, value: float) -> None:
+    if isinstance(value, int) and key not in ZERO_ALLOWED and value < 1:
+        raise UsageError(f"{key} = {value}; expected at least 1")
+    if value < 0 and not key.startswith(NEGATIVE_ALLOWED):
+        raise UsageError(f"{key} = {value}; expected at least 0")
+    if value == 0 and key in POSITIVE:
+        raise UsageError(f"{key} = {value}; expected more than 0")
+    if value >= 1 and key in BELOW_ONE:
+        raise UsageError(f"{key} = {value}; expected less than 1")
+
+
+def _numbers(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Every number of nested settings with its dotted key; those in lists one by one."""
+    for key, value in values.items():
+        name = prefix + key
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{name}.")
+        else:
+            for entry in value if isinstance(value, list) else [value]:
+                if isinstance(entry, int | float) and not isinstance(entry, bool):
+                    yield name, entry
+
+
+def _divisors(number: int) -> list[int]:
+    return [divisor for divisor in range(1, number + 1) if number % divisor == 0]
+
+
+def _largest_divisor(number: int, limit: int) -> int:
+    return max((d for d in _divisors(number) if d <= limit), default=1)

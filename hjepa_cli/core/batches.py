@@ -1,0 +1,84 @@
+"""Training batches: whole sub-sampled trajectories, so that one encoding of a frame serves as
+start, target and inverse-dynamics sample at once."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class TrajectoryBatch:
+    """B windows of F frames, ``stride`` control steps apart.
+
+    Attributes:
+        frames: uint8 [B · F, 2, H, W, 3], (previous, current).
+        actions: applied actions ÷ force limit [B, F − 1, stride] between the frames.
+    """
+
+    frames: Tensor
+    actions: Tensor
+
+
+def window_indices(
+    length: int, frames: int, stride: int, generator: np.random.Generator, count: int
+) -> NDArray[np.int64]:
+    """Steps k of ``count`` random windows inside 0 … length − 1: int64 [count, frames]."""
+    last_start = length - 1 - (frames - 1) * stride
+    starts = generator.integers(0, last_start + 1, size=count)
+    return starts[:, None] + stride * np.arange(frames)[None, :]
+
+
+def stride_actions(actions: Tensor, steps: Tensor, stride: int) -> Tensor:
+    """Actions of every stride: [B, T] and frame steps [B, F] → [B, F − 1, stride].
+
+    Row f holds u_k … u_{k + stride − 1} for k = steps[f], the actions that lead from frame f to
+    frame f + 1.
+    """
+    offsets = steps[:, :-1, None] + torch.arange(stride)
+    batch = torch.arange(len(actions))[:, None, None]
+    return actions[batch, offsets]
+
+
+class FrameWindows:
+    """Draws :class:`TrajectoryBatch` es from rendered trajectories.
+
+    Args:
+        frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.
+        actions: applied actions ÷ force limit [N, T].
+        window_frames, stride: F and the control steps between frames.
+        mirror: flip half of the windows left to right and negate their actions, which is exact
+            physics and doubles the data.
+    """
+
+    def __init__(
+        self,
+        frames: Tensor,
+        actions: Tensor,
+        *,
+        window_frames: int,
+        stride: int,
+        mirror: bool,
+    ) -> None:
+        self.frames, self.actions = frames, actions
+        self.steps = actions.shape[1]
+        self.window_frames = min(window_frames, (self.steps - 1) // stride + 1)
+        self.stride, self.mirror = stride, mirror
+
+    def draw(self, count: int, generator: np.random.Generator) -> TrajectoryBatch:
+        """``count`` windows from trajectories drawn without replacement where they suffice."""
+        total = len(self.frames)
+        chosen = generator.choice(total, size=count, replace=count > total)
+        steps = window_indices(self.steps, self.window_frames, self.stride, generator, count)
+        trajectories = torch.from_numpy(chosen)
+        k = torch.from_numpy(steps)
+        actions = stride_actions(self.actions[trajectories], k, self.stride)
+        rows = trajectories[:, None]
+        pairs = torch.stack([self.frames[rows, k], self.frames[rows, k + 1]], dim=2)
+        if self.mirror:
+            flipped = torch.from_numpy(generator.random(count) < 0.5)
+            pairs[flipped] = pairs[flipped].flip(-2)
+            actions = torch.where(flipped[:, None, None], -actions, actions)
+        return TrajectoryBatch(pairs.flatten(0, 1), actions)

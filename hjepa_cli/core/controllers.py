@@ -1,0 +1,122 @@
+"""What sits in the cloud: controllers that turn packets into forces.
+
+Nothing here can reach a plant: a controller is built from functions of what it received (a
+planner, an actor, the equations of motion), never from the simulator that it drives.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+class Planner(Protocol):
+    """Turns embeddings into one stride of forces and the embedding the next stride starts from."""
+
+    @property
+    def stride(self) -> int: ...
+
+    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Embeddings [n, D] → forces_n [n, stride], next embeddings [n, D]."""
+        ...
+
+
+class StrideController:
+    """Plays a planner: one stride at a time, a packet starts a new stride at once.
+
+    Args:
+        planner: see :class:`Planner`.
+        devices: n.
+    """
+
+    def __init__(self, planner: Planner, devices: int) -> None:
+        self._planner = planner
+        self._forces_n = torch.zeros(devices, planner.stride)
+        self._anchors = torch.zeros(devices, 0)  # takes its width from the first packets
+        self._phase = np.full(devices, planner.stride)
+
+    @torch.inference_mode()
+    def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
+        """Forces of one step [n]; packets are embeddings [delivered.sum(), D].
+
+        The first call must deliver to every device.
+        """
+        if packets is not None:
+            if not self._anchors.shape[1]:
+                self._anchors = packets.new_zeros(len(delivered), packets.shape[1])
+            self._anchors[torch.from_numpy(delivered)] = packets
+        due = np.flatnonzero(delivered | (self._phase == self._planner.stride))
+        if len(due):
+            rows = torch.from_numpy(due)
+            forces_n, self._anchors[rows] = self._planner.plan(self._anchors[rows])
+            self._forces_n[rows] = forces_n.float().cpu()
+            self._phase[due] = 0
+        played = self._forces_n.numpy()[np.arange(len(delivered)), self._phase]
+        self._phase += 1
+        return played.astype(np.float64)
+
+
+class LastForce:
+    """No prediction: act on each packet, then keep that force (hold) or none (zero).
+
+    With the teacher as actor and a packet at every step this is the optimal controller.
+
+    Args:
+        actor: packets [m, ...] → forces_n [m].
+        devices: n.
+        keep: hold the last force between packets; ``False`` applies 0 N.
+    """
+
+    def __init__(self, actor: Callable[[Any], Any], devices: int, *, keep: bool) -> None:
+        self._actor, self._keep = actor, keep
+        self._forces_n = np.zeros(devices)
+
+    @torch.inference_mode()
+    def act(self, delivered: Bools, packets: Any) -> Floats:
+        """Forces of one step [n]."""
+        if not self._keep:
+            self._forces_n[:] = 0.0
+        if packets is not None:
+            forces_n = self._actor(packets)
+            is_tensor = isinstance(forces_n, Tensor)
+            self._forces_n[delivered] = forces_n.float().cpu().numpy() if is_tensor else forces_n
+        return self._forces_n.copy()
+
+
+class Oracle:
+    """The ceiling for any predictor: the true state at each packet, exact equations in between.
+
+    It knows the noise-free equations of the nominal plant, not the noise and not a device's own
+    masses.
+
+    Args:
+        actor: states [m, 4] → forces_n [m], the teacher.
+        advance: one control step, states [n, 4] and applied forces_n [n] → states [n, 4].
+        force_limit_n: the actuator clips here, and the oracle knows.
+        devices: n.
+    """
+
+    def __init__(
+        self,
+        actor: Callable[[Floats], Floats],
+        advance: Callable[[Floats, Floats], Floats],
+        force_limit_n: float,
+        devices: int,
+    ) -> None:
+        self._actor, self._advance, self._limit_n = actor, advance, force_limit_n
+        self._states = np.zeros((devices, 4))
+
+    def act(self, delivered: Bools, packets: Floats | None) -> Floats:
+        """Forces of one step [n]; packets are true states [delivered.sum(), 4]."""
+        if packets is not None:
+            self._states[delivered] = packets
+        forces_n = np.clip(self._actor(self._states), -self._limit_n, self._limit_n)
+        # ±50 is where the loop clips true states too: a lost pole must not overflow.
+        self._states = np.clip(self._advance(self._states, forces_n), -50.0, 50.0)
+        return forces_n

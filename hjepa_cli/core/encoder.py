@@ -1,0 +1,100 @@
+"""The context encoder Ψ: two camera frames in, one embedding out (paper §III-A, spec §3).
+
+A residual network with three stages of 64, 128 and 256 channels keeps an 4 × 8 map to its last
+layer, because a cart-pole is where things are: global average pooling would throw the positions
+away. Frames travel as uint8 [N, 2, H, W, 3] (previous, current), which is already channels-last
+memory, the layout the convolutions are fastest in.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
+STEM_PX = 4
+MAP_CHANNELS = 32
+
+
+def normalise(z: Tensor) -> Tensor:
+    """Scale embeddings [..., D] to length √D: unit mean square, whatever the encoder put out.
+
+    The cosine loss ignores lengths; fixing them here gives actor and predictors, which do see
+    them, one scale for encoded and predicted embeddings.
+    """
+    return F.normalize(z, dim=-1) * z.shape[-1] ** 0.5
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 × 3 convolutions with batch norm around a (projected) identity."""
+
+    def __init__(self, channels_in: int, channels_out: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
+        self.norm1 = nn.BatchNorm2d(channels_out)
+        self.conv2 = nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False)
+        self.norm2 = nn.BatchNorm2d(channels_out)
+        self.project = nn.Conv2d(channels_in, channels_out, 1, stride, bias=False)
+        self.project_norm = nn.BatchNorm2d(channels_out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.relu(self.norm1(self.conv1(x)))
+        return F.relu(self.norm2(self.conv2(y)) + self.project_norm(self.project(x)))
+
+
+class Encoder(nn.Module):
+    """Ψ_θ: uint8 frames [N, 2, 64, 128, 3] → embeddings [N, D] of length √D.
+
+    Args:
+        embedding: D, 256 in the paper.
+        frame_input: ``"difference"`` feeds [current, current − previous], each standardised by
+            its own training statistics, which makes the sub-pixel velocity signal visible;
+            ``"pair"`` feeds [current, previous] (the paper).
+        centre: batch-normalise z (no affine) before its length is fixed.
+    """
+
+    frame_mean: Tensor
+    frame_std: Tensor
+    second_mean: Tensor
+    second_std: Tensor
+
+    def __init__(self, embedding: int, frame_input: str, centre: bool) -> None:
+        super().__init__()
+        self.frame_input = frame_input
+        for name, value in (("mean", 0.0), ("std", 1.0)):
+            self.register_buffer(f"frame_{name}", torch.full((CHANNELS,), value))
+            self.register_buffer(f"second_{name}", torch.full((CHANNELS,), value))
+        self.stem = nn.Conv2d(2 * CHANNELS, 64, STEM_PX, STEM_PX, bias=False)
+        self.stem_norm = nn.BatchNorm2d(64)
+        self.stages = nn.Sequential(
+            ResidualBlock(64, 64, 2), ResidualBlock(64, 128, 2), ResidualBlock(128, 256, 1)
+        )
+        map_size = (HEIGHT_PX // (STEM_PX * 4)) * (WIDTH_PX // (STEM_PX * 4))
+        self.squeeze = nn.Conv2d(256, MAP_CHANNELS, 1)
+        self.head = nn.Linear(MAP_CHANNELS * map_size, embedding)
+        self.centre = nn.BatchNorm1d(embedding, affine=False) if centre else nn.Identity()
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def fit_standardisation(self, frames: Tensor) -> None:
+        """Measure per-channel mean and standard deviation of both inputs on uint8 frames."""
+        first, second = self._inputs(frames)
+        for name, values in (("frame", first), ("second", second)):
+            flat = values.reshape(-1, CHANNELS)
+            getattr(self, f"{name}_mean").copy_(flat.mean(0))
+            getattr(self, f"{name}_std").copy_(flat.std(0).clamp_min(1e-3))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        first, second = self._inputs(frames)
+        x = torch.cat(
+            [
+                (first - self.frame_mean) / self.frame_std,
+                (second - self.second_mean) / self.second_std,
+            ],
+            dim=-1,
+        ).permute(0, 3, 1, 2)  # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free
+        x = F.relu(self.stem_norm(self.stem(x)))
+        x = F.relu(self.squeeze(self.stages(x)))
+        return normalise(self.centre(self.head(x.flatten(1)).float()))
+
+    def _inputs(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        previous, current = frames[:, 0].float(), frames[:, 1].float()
+        return current, current - previous if self.frame_input == "difference" else previous

@@ -1,0 +1,58 @@
+"""Is the representation alive, and does it know the state? The numbers behind the stage gates.
+
+All functions take plain float tensors; nothing here trains the encoder (docs/metrics.md lists the
+healthy ranges).
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+STATE_NAMES = ("x", "x_dot", "theta", "theta_dot")
+
+
+def probe_r2(
+    train_z: Tensor, train_states: Tensor, test_z: Tensor, test_states: Tensor
+) -> dict[str, float]:
+    """Held-out R² of a linear least-squares probe from embeddings to each state.
+
+    Args:
+        train_z, test_z: embeddings [N, D] and [N', D].
+        train_states, test_states: [N, 4] and [N', 4], order :data:`STATE_NAMES`.
+    """
+    design = _with_intercept(train_z)
+    # A tiny ridge keeps collapsed embeddings solvable; 1e-6 of the mean square moves no healthy R².
+    gram = design.T @ design
+    ridge = 1e-6 * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
+    weights = torch.linalg.solve(gram + ridge, design.T @ train_states.double())
+    truth = test_states.double()
+    residual = truth - _with_intercept(test_z) @ weights
+    r2 = 1.0 - residual.square().sum(0) / (truth - truth.mean(0)).square().sum(0)
+    return dict(zip(STATE_NAMES, r2.tolist(), strict=True))
+
+
+def effective_rank(z: Tensor) -> float:
+    """exp of the entropy of the normalised squared singular values of centred z [N, D]."""
+    energy = torch.linalg.svdvals((z - z.mean(0)).double()).square()
+    share = energy / energy.sum().clamp_min(1e-30)
+    return float(torch.exp(-(share * torch.log(share.clamp_min(1e-30))).sum()))
+
+
+def action_sensitivity(
+    predict: Callable[[Tensor, Tensor], Tensor], z: Tensor, z_next: Tensor, steps: int
+) -> float:
+    """mean ‖P(z, +u_max) − P(z, −u_max)‖ ÷ mean ‖z_{k+h} − z_k‖ over embeddings [N, D]."""
+    full = torch.ones(len(z), steps, dtype=z.dtype)
+    spread = (predict(z, full) - predict(z, -full)).norm(dim=-1).mean()
+    return float(spread / (z_next - z).norm(dim=-1).mean().clamp_min(1e-12))
+
+
+def nrmse(predicted: Tensor, truth: Tensor) -> float:
+    """Root mean square error ÷ root mean square of the truth."""
+    return float((predicted - truth).square().mean().sqrt() / truth.square().mean().sqrt())
+
+
+def _with_intercept(z: Tensor) -> Tensor:
+    z = z.double()
+    return torch.cat([z, torch.ones(len(z), 1, dtype=z.dtype)], dim=1)

@@ -1,0 +1,189 @@
+"""The hierarchy of predictors: how strides nest, in training and in the closed loop (spec §3).
+
+Notation: a packet at step k restarts all grids at k. Coarse anchors lie at a = k, k + h, …; the
+medium level fills a + m, a + 2m, … inside each gap, the low level l, 2l, … inside each m-step.
+Actions are in units of the force limit everywhere in this file.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from hjepa_cli.core.losses import cosine_loss
+from hjepa_cli.core.predictors import Predictor
+from hjepa_cli.errors import UsageError
+
+
+class Step(Protocol):
+    """What the schemes below ask of a predictor (see :class:`Predictor`)."""
+
+    def __call__(
+        self, z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+    ) -> Tensor: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Strides:
+    """Strides of the three levels in control steps.
+
+    Raises:
+        UsageError: unless h is a multiple of m and m a multiple of l, all positive.
+    """
+
+    h: int
+    m: int
+    l: int  # noqa: E741 - the paper's symbol
+
+    def __post_init__(self) -> None:
+        if self.h < 1:
+            raise UsageError(f"--h {self.h}: strides are positive whole numbers")
+        for name, value, outer_name, outer in (
+            ("m", self.m, "h", self.h),
+            ("l", self.l, "m", self.m),
+        ):
+            if value < 1 or outer % value:
+                valid = ", ".join(str(d) for d in range(1, outer + 1) if outer % d == 0)
+                raise UsageError(
+                    f"--{name} {value} does not divide --{outer_name} {outer}; "
+                    f"choose --{name} from {valid}"
+                )
+
+
+def rollout_loss(
+    predictor: Step, z: Tensor, targets: Tensor, actions: Tensor, starts: Tensor, horizon: int
+) -> Tensor:
+    """Cosine loss of autoregressive rollouts from many starts, averaged over the rollout steps.
+
+    Args:
+        predictor: one stride per call.
+        z: embeddings the rollouts start from [B, F, D], frames one stride apart.
+        targets: embeddings to reach [B, F, D].
+        actions: [B, F − 1, steps], ``actions[:, f]`` lead from frame f to f + 1.
+        starts: ascending frame indices [S] to start from, the same for all B.
+        horizon: strides to roll out; a start stops early where the window ends.
+
+    Returns:
+        Mean over rollout steps of the mean loss of the starts still running.
+    """
+    frames, width = z.shape[1], z.shape[2]
+    state = z[:, starts]
+    losses = []
+    for step in range(horizon):
+        running = int((starts + step + 1 < frames).sum())
+        if running == 0:
+            break
+        now = starts[:running] + step
+        state = predictor(
+            state[:, :running].reshape(-1, width), actions[:, now].flatten(0, 1)
+        ).reshape(-1, running, width)
+        losses.append(cosine_loss(state, targets[:, now + 1]))
+    return torch.stack(losses).mean()
+
+
+def rollout(predictor: Step, z: Tensor, actions: Tensor) -> Tensor:
+    """Autoregressive prediction: z [N, D], actions [N, S, steps] → [N, S + 1, D] with z first."""
+    states = [z]
+    for stride in range(actions.shape[1]):
+        states.append(predictor(states[-1], actions[:, stride]))
+    return torch.stack(states, dim=1)
+
+
+def fill_gap(predictor: Step, left: Tensor, right: Tensor, actions: Tensor) -> Tensor:
+    """Interpolate inside one gap: the finer level walks from ``left`` towards the fixed ``right``.
+
+    Args:
+        predictor: the finer level's step.
+        left, right: embeddings [N, D] at both ends of the gap.
+        actions: [N, C, steps], one row per sub-stride.
+
+    Returns:
+        Embeddings [N, C + 1, D] on the finer grid, both ends included.
+    """
+    count = actions.shape[1]
+    states = [left]
+    for index in range(count - 1):
+        states.append(
+            predictor(states[-1], actions[:, index], anchor=right, remaining=count - index)
+        )
+    return torch.stack([*states, right], dim=1)
+
+
+def plan_stride(
+    act: Callable[[Tensor], Tensor],
+    coarse: Step,
+    medium: Step,
+    low: Step,
+    z: Tensor,
+    strides: Strides,
+    *,
+    recompute_anchor: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Play one coarse stride from its anchor, the controller's only work inside a gap.
+
+    The coarse prediction is first made with the anchor's action held; the finer levels then fill
+    in embeddings and their own actions; finally the anchor is predicted again with those actions
+    and the next stride starts there.
+
+    Args:
+        act: embeddings [N, D] → actions [N].
+        coarse, medium, low: P^H, P^M, P^L.
+        z: anchor embeddings [N, D].
+        strides: (h, m, l).
+        recompute_anchor: ``False`` keeps the first coarse prediction (the paper's literal reading).
+
+    Returns:
+        Actions [N, h]; embeddings [N, h / l, D] on the finest grid they were taken at;
+        the next anchor [N, D].
+    """
+    h, m, l = strides.h, strides.m, strides.l  # noqa: E741
+    first = act(z)
+    anchor = coarse(z, hold(first, h))
+    embeddings, actions = [], []
+    z_b, action_b = z, first
+    for left in range(h // m, 0, -1):
+        z_next = anchor if left == 1 else medium(z_b, hold(action_b, m), anchor, left)
+        z_c, action_c = z_b, action_b
+        for remaining in range(m // l, 0, -1):
+            embeddings.append(z_c)
+            actions.append(hold(action_c, l))
+            if remaining > 1:
+                z_c = low(z_c, hold(action_c, l), z_next, remaining)
+                action_c = act(z_c)
+        if left > 1:
+            z_b, action_b = z_next, act(z_next)
+    played = torch.cat(actions, dim=1)
+    if recompute_anchor:
+        anchor = coarse(z, played)
+    return played, torch.stack(embeddings, dim=1), anchor
+
+
+def hold(action: Tensor, steps: int) -> Tensor:
+    """Repeat actions [N] over ``steps`` control steps: [N, steps]."""
+    return action.unsqueeze(-1).expand(-1, steps)
+
+
+def build_predictors(
+    strides: Strides, embedding: int, hidden: int, *, all_actions: bool, residual: bool
+) -> dict[str, Predictor]:
+    """The three levels and the flat baseline ``ts-jepa-1``, keyed as in the checkpoint."""
+    h, m, l = strides.h, strides.m, strides.l  # noqa: E741
+
+    def level(steps: int, **anchoring: int) -> Predictor:
+        return Predictor(
+            embedding,
+            hidden,
+            steps if all_actions else 1,
+            anchored=bool(anchoring),
+            residual=residual,
+            **anchoring,
+        )
+
+    return {
+        "high": level(h),
+        "medium": level(m, distances=h // m),
+        "low": level(l, distances=m // l),
+        "flat": level(1),
+    }

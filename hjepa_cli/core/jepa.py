@@ -1,0 +1,79 @@
+"""The joint-embedding objective: context encoder, EMA target, companion P^H, inverse dynamics."""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+
+from hjepa_cli.core.batches import TrajectoryBatch
+from hjepa_cli.core.ema import EmaTarget
+from hjepa_cli.core.encoder import Encoder
+from hjepa_cli.core.hierarchy import rollout_loss
+from hjepa_cli.core.losses import InverseDynamics
+from hjepa_cli.core.predictors import Predictor
+
+
+class Jepa:
+    """Ψ_θ and P^H trained together (paper eqs. 4-6), with an optional auxiliary task.
+
+    Args:
+        encoder: the context encoder; the target starts as its copy.
+        predictor: companion P^H, one stride per call.
+        ema_decay: η.
+        inverse_dynamics: weight of the inverse-dynamics loss; 0 leaves it out.
+        rollout_strides: length of the training rollouts in strides.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        predictor: Predictor,
+        *,
+        ema_decay: float,
+        inverse_dynamics: float,
+        rollout_strides: int,
+        device: torch.device,
+    ) -> None:
+        self.encoder, self.predictor = encoder.to(device), predictor.to(device)
+        self.target = EmaTarget(encoder, ema_decay)
+        self.rollout_strides = rollout_strides
+        self.weights = {"prediction": 1.0}
+        self.inverse: InverseDynamics | None = None
+        if inverse_dynamics > 0.0:
+            self.weights["inverse_dynamics"] = inverse_dynamics
+            self.inverse = InverseDynamics(encoder.head.out_features).to(device)
+        self.device = device
+
+    def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
+        """Named loss terms of one batch, before weighting; names equal those of ``weights``."""
+        frames, actions = batch.frames.to(self.device), batch.actions.to(self.device)
+        windows, strides = actions.shape[0], actions.shape[1]
+        z = self.encoder(frames).unflatten(0, (windows, strides + 1))
+        with torch.no_grad():
+            targets = self.target.module(frames).unflatten(0, (windows, strides + 1))
+        starts = torch.arange(strides, device=self.device)
+        terms = {
+            "prediction": rollout_loss(
+                self.predictor, z, targets, actions, starts, self.rollout_strides
+            )
+        }
+        if self.inverse is not None:
+            terms["inverse_dynamics"] = self.inverse.loss(
+                z[:, :-1].flatten(0, 1), z[:, 1:].flatten(0, 1), actions.mean(-1).flatten()
+            )
+        return terms
+
+    def total(self, terms: dict[str, Tensor]) -> Tensor:
+        """Weighted sum; a term without a weight, or a weight without a term, is a bug."""
+        assert terms.keys() == self.weights.keys(), (sorted(terms), sorted(self.weights))
+        return torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
+
+    def update_target(self) -> None:
+        """Move the target encoder after an optimiser step."""
+        self.target.update(self.encoder)
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """Everything the optimiser trains (the target is not among it)."""
+        for module in (self.encoder, self.predictor, self.inverse):
+            if module is not None:
+                yield from module.parameters()

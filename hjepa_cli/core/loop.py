@@ -1,0 +1,236 @@
+"""The closed loop: plants, the link's schedule and a controller, batched over devices and points.
+
+One step k of every loop, in this order:
+
+1. a device that transmits at k senses its state (frames k - 1 and k, or the true state) and the
+   controller receives the packet, without delay;
+2. the controller picks the force u_k, from packets alone;
+3. step k is scored on the state x_k and the force u_k;
+4. the plant moves to x_{k+1} under u_k and process noise.
+
+Devices N and curve points P (different link schedules on the same draws) share one simulation.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hjepa_cli.core.metrics import in_band, stage_cost
+from hjepa_cli.core.plant import CartPoles, Plant
+from hjepa_cli.core.seeding import generator
+from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.settings import ProtocolSettings
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
+_DRAWS_KEY = 0xD4A5
+
+
+class Controller(Protocol):
+    """The remote side. It has no way to the plant: packets come in, forces go out."""
+
+    def act(self, delivered: Bools, packets: Any) -> Floats:
+        """Forces of one step.
+
+        Args:
+            delivered: which devices' packets arrive at this step [n].
+            packets: what they carry [delivered.sum(), ...]; ``None`` when there are none.
+
+        Returns:
+            Forces in newton [n].
+        """
+        ...
+
+
+Sensor = Callable[[Floats, Floats], Any]
+"""The device side: previous states [m, 4], current states [m, 4] → packets [m, ...]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Draws:
+    """Everything random in the closed loop, common to all methods and curve points.
+
+    Device i's draws come from its own generator: they do not depend on how many devices there
+    are, so the first 64 of 256 devices are the 64 devices.
+
+    Attributes:
+        initial: states at k = -1 [N, 4].
+        noise: added to the states after each step [steps, N, 4].
+        delivery: uniform numbers; a packet gets through where they are below p [steps, N].
+        mass_scale: each device's cart and pole mass ÷ nominal [N, 2].
+    """
+
+    initial: Floats
+    noise: Floats
+    delivery: Floats
+    mass_scale: Floats
+
+    @classmethod
+    def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
+        """Draw for ``devices`` devices, all derived from ``seed``."""
+        half_widths = np.array(
+            [protocol.x_m, protocol.x_dot_m_s, protocol.theta_rad, protocol.theta_dot_rad_s]
+        )
+        initial = np.empty((devices, 4))
+        noise = np.empty((protocol.steps, devices, 4))
+        delivery = np.empty((protocol.steps, devices))
+        mass_scale = np.empty((devices, 2))
+        for device in range(devices):
+            random = generator(seed, _DRAWS_KEY, device)
+            initial[device] = random.uniform(-1, 1, 4) * half_widths
+            mass_scale[device] = 1 + protocol.plant_spread * random.uniform(-1, 1, 2)
+            delivery[:, device] = random.random(protocol.steps)
+            noise[:, device] = random.standard_normal((protocol.steps, 4))
+        return cls(initial, noise * noise_per_step(protocol), delivery, mass_scale)
+
+    @property
+    def devices(self) -> int:
+        return len(self.initial)
+
+    @property
+    def steps(self) -> int:
+        return len(self.noise)
+
+    def first(self, devices: int) -> "Draws":
+        """The draws of the first ``devices`` devices alone."""
+        return Draws(
+            self.initial[:devices],
+            self.noise[:, :devices],
+            self.delivery[:, :devices],
+            self.mass_scale[:devices],
+        )
+
+
+def noise_per_step(protocol: ProtocolSettings) -> Floats:
+    """Standard deviation of the process noise of one step in (x, ẋ, θ, θ̇).
+
+    ``velocity`` disturbs ẋ and θ̇, as forces would; ``isotropic`` has one standard deviation, that
+    of ẋ, in all four states (the paper's n_s, whose size it leaves open).
+    """
+    if protocol.process_noise == "isotropic":
+        return np.full(4, protocol.noise_x_dot_m_s)
+    return np.array([0.0, protocol.noise_x_dot_m_s, 0.0, protocol.noise_theta_dot_rad_s])
+
+
+def every_step(steps: int, devices: int) -> Bools:
+    """The schedule of a perfect link: bool [steps, devices], all true."""
+    return np.ones((steps, devices), dtype=bool)
+
+
+def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
+    """One packet every D steps: device i sends at 0 and at ⌈nD + φ_i⌉, φ_i = i mod D, n = 0, 1, …
+
+    Args:
+        gap_steps: D ≥ 1, whole or fractional.
+
+    Returns:
+        bool [steps, devices].
+
+    Raises:
+        UsageError: D < 1.
+    """
+    if not gap_steps >= 1:
+        raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer")
+    phases = np.fmod(np.arange(devices), gap_steps)
+    periods = np.arange(int(steps / gap_steps) + 1)
+    # 1e-9 keeps a sum that is whole up to rounding from being sent one step late.
+    times = np.ceil(periods[:, None] * gap_steps + phases - 1e-9).astype(np.int64)
+    schedule = np.zeros((steps, devices), dtype=bool)
+    period, device = np.nonzero(times < steps)
+    schedule[times[period, device], device] = True
+    schedule[0] = True
+    return schedule
+
+
+def delivery_schedule(probability: float, delivery: Floats) -> Bools:
+    """Every step is sent and gets through with probability p; the first packet always does.
+
+    Args:
+        probability: p in 0 … 1.
+        delivery: uniform numbers [steps, devices].
+
+    Returns:
+        bool [steps, devices].
+
+    Raises:
+        UsageError: p outside 0 … 1.
+    """
+    if not 0 <= probability <= 1:
+        raise UsageError(f"delivery probability {probability}; it lies between 0 and 1")
+    schedule = delivery < probability
+    schedule[0] = True
+    return schedule
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a simulation measured, averaged over its steps.
+
+    Attributes:
+        score: share of steps inside the band [P, N].
+        cost: mean capped quadratic cost [P, N].
+    """
+
+    score: Floats
+    cost: Floats
+
+
+def simulate(
+    plant: Plant,
+    draws: Draws,
+    delivered: Bools,
+    controller: Controller,
+    sensor: Sensor,
+    *,
+    tick: Callable[[], None] = lambda: None,
+) -> Outcome:
+    """Run P × N closed loops at once.
+
+    Args:
+        plant: the cart-pole; device masses are scaled by ``draws.mass_scale``.
+        draws: initial states, noise and deliveries of N devices.
+        delivered: link schedules [P, steps, N]; see :func:`gap_schedule`.
+        controller: drives P · N devices, point by point; in its initial state.
+        sensor: turns states into packets.
+        tick: called after every step, for progress.
+
+    Raises:
+        NumericalError: the controller returned a force that is not finite.
+    """
+    points, steps, devices = delivered.shape
+    assert (steps, devices) == draws.delivery.shape, (delivered.shape, draws.delivery.shape)
+    poles = CartPoles(plant, points * devices, mass_scale=np.tile(draws.mass_scale, (points, 1)))
+    poles.states = np.tile(draws.initial, (points, 1))
+    previous = poles.states
+    poles.step(np.zeros(points * devices))  # the camera needs the frame before k = 0
+    score, cost = np.zeros(points * devices), np.zeros(points * devices)
+    for k in range(steps):
+        states = poles.states
+        sent = delivered[:, k].reshape(-1)
+        packets = sensor(previous[sent], states[sent]) if sent.any() else None
+        forces = controller.act(sent, packets)
+        if not np.isfinite(forces).all():
+            raise NumericalError(f"the controller's force is not finite at step {k}")
+        forces = np.clip(forces, -plant.force_limit_n, plant.force_limit_n)
+        score += in_band(states)
+        cost += stage_cost(states, forces, plant.state_weights, plant.force_weight)
+        previous = states
+        poles.step(forces)
+        moved = poles.states.reshape(points, devices, 4) + draws.noise[k]
+        poles.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT).reshape(-1, 4)
+        tick()
+    shape = (points, devices)
+    return Outcome(score.reshape(shape) / steps, cost.reshape(shape) / steps)
+
+
+def play(controller: Controller, packets: Any, devices: int, steps: int) -> Floats:
+    """What a controller plays after a single packet at k = 0: forces [devices, steps]."""
+    arrives = np.ones(devices, dtype=bool)
+    forces = [controller.act(arrives, packets)]
+    forces += [controller.act(~arrives, None) for _ in range(steps - 1)]
+    return np.stack(forces, axis=1)

@@ -1,0 +1,37 @@
+"""Training objectives, as pure functions of tensors."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def cosine_loss(predicted: Tensor, target: Tensor) -> Tensor:
+    """1 − cos(z̃, sg(z)), averaged over all leading axes; inputs [..., D].
+
+    The paper prints arg min of the cosine itself (eq. 6), a sign slip.
+    """
+    return 1.0 - F.cosine_similarity(predicted, target.detach(), dim=-1).mean()
+
+
+class InverseDynamics(nn.Module):
+    """Which action led from z_k to z_{k+h}? An auxiliary task that needs actions only, no state.
+
+    It makes the encoder keep what actions change, the velocities above all (ours; it turned the
+    recipe from useless to better than supervised, see docs/LOG.md). Used in training only.
+    """
+
+    def __init__(self, embedding: int, hidden: int = 256) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(2 * embedding, hidden), nn.ReLU(), nn.Linear(hidden, 1)
+        )
+
+    def loss(self, z: Tensor, z_next: Tensor, action: Tensor) -> Tensor:
+        """Mean squared error of the action, in units of half the force limit (10 N).
+
+        Args:
+            z, z_next: embeddings [N, D] a stride apart.
+            action: [N] mean applied action of the stride, in units of the force limit.
+        """
+        predicted = self.layers(torch.cat([z, z_next], dim=-1)).squeeze(-1)
+        return F.mse_loss(predicted, 2.0 * action)

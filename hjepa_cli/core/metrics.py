@@ -1,0 +1,137 @@
+"""Every number of the closed loop: scores, costs, control error, intervals, tolerances (spec §4).
+
+Notation for shapes: N devices, P curve points, B bootstrap replicates. Intervals are percentile
+intervals of a bootstrap over devices; the same devices are drawn for a method and for its
+reference, so what both share (a hard start, a gust) cancels.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hjepa_cli.core.seeding import generator
+
+Floats = NDArray[np.float64]
+
+SCORE_X_M = 0.05
+SCORE_THETA_RAD = 0.05
+COST_CAP = 50.0
+CONFIDENCE = 0.95
+WINDOWS = ((1, 20), (21, 40), (41, 80), (81, 100))
+_BOOTSTRAP_KEY = 0xB007
+
+
+def in_band(states: Floats) -> NDArray[np.bool_]:
+    """Score of a step: |x| ≤ 0.05 m and |θ| ≤ 0.05 rad. States [..., 4] → bool [...]."""
+    return (np.abs(states[..., 0]) <= SCORE_X_M) & (np.abs(states[..., 2]) <= SCORE_THETA_RAD)
+
+
+def stage_cost(
+    states: Floats, forces_n: Floats, state_weights: Sequence[float], force_weight: float
+) -> Floats:
+    """Quadratic cost min(xᵀQx + R u², 50) of one step, so that one fallen pole stays finite.
+
+    Args:
+        states: [..., 4] in SI units.
+        forces_n: applied forces [...].
+        state_weights: diagonal of Q, the teacher's.
+        force_weight: R, the teacher's.
+    """
+    cost = states**2 @ np.asarray(state_weights, dtype=np.float64) + force_weight * forces_n**2
+    return np.minimum(cost, COST_CAP)
+
+
+def bootstrap_weights(samples: int, replicates: int, seed: int) -> Floats:
+    """How often each sample appears in each bootstrap replicate, ÷ samples: [B, N], rows sum to 1.
+
+    ``weights @ values`` is then the mean of every replicate.
+    """
+    drawn = generator(seed, _BOOTSTRAP_KEY, samples).integers(samples, size=(replicates, samples))
+    offsets = np.arange(replicates)[:, None] * samples
+    counts = np.bincount((drawn + offsets).ravel(), minlength=replicates * samples)
+    return counts.reshape(replicates, samples) / samples
+
+
+def interval(replicates: Floats) -> Floats:
+    """95 % percentile interval over the first axis: [B, ...] → [2, ...].
+
+    Takes order statistics as they are, so that infinite replicates (no crossing) stay infinite.
+    """
+    tail = (1 - CONFIDENCE) / 2
+    low = np.quantile(replicates, tail, axis=0, method="inverted_cdf")
+    high = np.quantile(replicates, 1 - tail, axis=0, method="inverted_cdf")
+    return np.stack([low, high])
+
+
+def mean_interval(values: Floats, weights: Floats) -> Floats:
+    """Interval of the mean: values [N, ...], weights [B, N] → [2, ...]."""
+    return interval(np.tensordot(weights, values, axes=1))
+
+
+def ratio(values: Floats, reference: Floats, weights: Floats | None = None) -> Floats:
+    """Mean of a method ÷ mean of its reference on the same devices.
+
+    Args:
+        values: [..., N].
+        reference: [N].
+        weights: bootstrap weights [B, N]; ``None`` is the plain mean.
+
+    Returns:
+        [...], or [B, ...] with weights; NaN where the reference is 0.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if weights is None:
+            return np.asarray(values.mean(axis=-1) / reference.mean())
+        reference_means = (weights @ reference).reshape(-1, *[1] * (values.ndim - 1))
+        return np.asarray(np.moveaxis(values @ weights.T, -1, 0) / reference_means)
+
+
+def first_crossing(gaps: Floats, scores: Floats, level: float, *, log: bool) -> Floats:
+    """Where each curve first falls below ``level``, interpolated between its points.
+
+    Args:
+        gaps: ascending mean gaps between packets [P], in steps.
+        scores: [..., P].
+        level: 0.62 for scores.
+        log: interpolate linearly in ln gap (= -ln p, delivery) instead of in the gap.
+
+    Returns:
+        Gaps [...]; -inf where the first point is below already, +inf where no point is.
+    """
+    x = np.log(gaps) if log else np.asarray(gaps, dtype=np.float64)
+    below = scores < level
+    right = np.argmax(below, axis=-1)
+    left = np.maximum(right - 1, 0)
+    y_left, y_right = (
+        np.take_along_axis(scores, i[..., None], axis=-1)[..., 0] for i in (left, right)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = x[left] + (x[right] - x[left]) * (y_left - level) / (y_left - y_right)
+    if log:
+        crossing = np.exp(crossing)
+    crossing = np.where(right == 0, -np.inf, crossing)
+    return np.where(below.any(axis=-1), crossing, np.inf)
+
+
+def control_error(forces_n: Floats, teacher_n: Floats, force_limit_n: float) -> Floats:
+    """|ũ - u*| ÷ the force range 2 · limit (40 N), elementwise; its mean is the NMAE."""
+    return np.abs(forces_n - teacher_n) / (2 * force_limit_n)
+
+
+def window_means(error: Floats, windows: Sequence[tuple[int, int]] = WINDOWS) -> dict[str, Floats]:
+    """Mean control error over the windows of the horizon, both ends included.
+
+    Args:
+        error: [..., J + 1], ``error[..., j]`` is j steps after the transmission.
+        windows: (first j, last j); windows beyond J are cut short or left out.
+
+    Returns:
+        ``{"1-20": [...], ...}``.
+    """
+    last = error.shape[-1] - 1
+    return {
+        f"{first}-{end}": error[..., first : end + 1].mean(axis=-1)
+        for first, end in windows
+        if first <= last
+    }

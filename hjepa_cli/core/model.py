@@ -1,0 +1,218 @@
+"""A trained model: encoder, predictors and actor in one object, as a checkpoint holds them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hjepa_cli.core.actor import Actor
+from hjepa_cli.core.encoder import Encoder
+from hjepa_cli.core.hierarchy import Strides, build_predictors, hold, plan_stride
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.training import autocast, resolve_device
+from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
+
+ENCODE_BATCH = 250
+
+
+class Planner(Protocol):
+    """Turns embeddings into one stride of forces and the embedding the next stride starts from."""
+
+    stride: int
+
+    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Embeddings [N, D] → forces_n [N, stride], next embeddings [N, D]."""
+        ...
+
+
+def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
+    """Instantiate the networks that ``architecture`` (checkpoint metadata) describes, untrained.
+
+    ``kind`` "encoder" has Ψ and its companion P^H; "hierarchy" has Ψ, all levels and the actor.
+    """
+    embedding, hidden = architecture["embedding"], architecture["hidden"]
+    strides = Strides(architecture["h"], architecture["m"], architecture["l"])
+    modules = nn.ModuleDict(
+        {"encoder": Encoder(embedding, architecture["frame_input"], architecture["centre"])}
+    )
+    predictors = build_predictors(
+        strides,
+        embedding,
+        hidden,
+        all_actions=architecture["stride_actions"] == "all",
+        residual=architecture["residual"],
+    )
+    if architecture["kind"] == "encoder":
+        modules["high"] = predictors["high"]
+        return modules
+    modules.update(predictors)
+    modules["actor"] = Actor(embedding, architecture["actor_hidden"], architecture["actor_dropout"])
+    return modules
+
+
+def load_modules(checkpoint: Checkpoint, kind: str) -> nn.ModuleDict:
+    """Rebuild the networks of a checkpoint, with strict names, shapes and dtypes.
+
+    Raises:
+        DataError: the checkpoint is of another kind or its tensors do not fit its architecture.
+    """
+    architecture = checkpoint.metadata["architecture"]
+    if architecture["kind"] != kind:
+        stage = {"encoder": "train-encoder", "hierarchy": "train-hierarchy"}
+        raise DataError(
+            f"{checkpoint.path} holds a {architecture['kind']} checkpoint, not a {kind} checkpoint",
+            hint=f"hjepa {stage[kind]}",
+        )
+    modules = build_modules(architecture)
+    expected = {
+        name: (str(tensor.numpy().dtype), tuple(tensor.shape))
+        for name, tensor in modules.state_dict().items()
+    }
+    check_tensors(checkpoint, expected)
+    modules.load_state_dict(
+        {name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()}
+    )
+    return modules.eval()
+
+
+def tensors_of(modules: nn.ModuleDict) -> dict[str, NDArray[Any]]:
+    """All parameters and buffers as arrays, ready for :func:`save_checkpoint`."""
+    return {
+        name: tensor.detach().cpu().contiguous().numpy()
+        for name, tensor in modules.state_dict().items()
+    }
+
+
+@torch.inference_mode()
+def encode_frames(
+    encoder: nn.Module, frames: Tensor, *, device: torch.device, precision: str
+) -> Tensor:
+    """uint8 frames [N, 2, H, W, 3] → float32 embeddings [N, D] on the CPU, in batches."""
+    parts = []
+    for start in range(0, len(frames), ENCODE_BATCH):
+        batch = frames[start : start + ENCODE_BATCH].to(device)
+        with autocast(device, precision):
+            parts.append(encoder(batch).float().cpu())
+    return torch.cat(parts)
+
+
+class Model:
+    """Everything inference needs, from one hierarchy checkpoint."""
+
+    def __init__(
+        self, modules: nn.ModuleDict, metadata: Mapping[str, Any], digest: str, device: str = "auto"
+    ) -> None:
+        self.architecture = metadata["architecture"]
+        self.metadata, self.digest = metadata, digest
+        self.plant_name: str = metadata["plant"]
+        self.precision: str = metadata["settings"]["encoder"]["precision"]
+        self.force_limit_n = plant(self.plant_name).force_limit_n
+        self.strides = Strides(*(self.architecture[name] for name in ("h", "m", "l")))
+        self.device = resolve_device(device)
+        self.modules = modules.to(self.device).eval()
+
+    @classmethod
+    def load(cls, path: Path, device: str = "auto") -> "Model":
+        """Read a hierarchy checkpoint.
+
+        Raises:
+            MissingInputError: no such file.
+            DataError: not an intact hierarchy checkpoint.
+        """
+        checkpoint = load_checkpoint(path)
+        modules = load_modules(checkpoint, "hierarchy")
+        return cls(modules, checkpoint.metadata, checkpoint.digest, device)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods this model can plan; P^H alone is TS-JEPA of depth h."""
+        return tuple(
+            dict.fromkeys(("hjepa", "ts-jepa-1", f"ts-jepa-{self.strides.h}", "hold", "zero"))
+        )
+
+    def encode(self, frames: NDArray[np.uint8]) -> Tensor:
+        """Frames uint8 [N, 2, 64, 128, 3] (previous, current) → embeddings float32 [N, D]."""
+        return encode_frames(
+            self.modules["encoder"],
+            torch.from_numpy(frames),
+            device=self.device,
+            precision=self.precision,
+        )
+
+    def actor(self, z: Tensor) -> Tensor:
+        """Embeddings [N, D] → forces_n [N], clipped to the force limit."""
+        return self.force_limit_n * self._act(z)
+
+    def planner(self, method: str) -> Planner:
+        """The planner behind ``method``, one of :attr:`methods`.
+
+        Raises:
+            UsageError: this model does not hold the method.
+        """
+        if method not in self.methods:
+            raise UsageError(
+                f"this model has no method '{method}'; choose from {', '.join(self.methods)}"
+            )
+        if method == "hjepa":
+            return _Hierarchical(self)
+        if method == "ts-jepa-1":
+            return _Flat(self, "flat", 1)
+        if method in ("hold", "zero"):
+            return _Repeat(self, keep=method == "hold")
+        return _Flat(self, "high", self.strides.h)
+
+    def _act(self, z: Tensor) -> Tensor:
+        return self.modules["actor"].act(z)  # type: ignore[no-any-return, operator]
+
+
+class _Hierarchical:
+    """H-JEPA: one coarse stride at a time, filled in by the finer levels."""
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self.stride = model.strides.h
+
+    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        modules = self._model.modules
+        actions, _, z_next = plan_stride(
+            self._model._act,
+            modules["high"],
+            modules["medium"],
+            modules["low"],
+            z,
+            self._model.strides,
+            recompute_anchor=self._model.architecture["stride_actions"] == "all",
+        )
+        return self._model.force_limit_n * actions, z_next
+
+
+class _Flat:
+    """TS-JEPA: one predictor of a fixed depth, the action held in between."""
+
+    def __init__(self, model: Model, name: str, stride: int) -> None:
+        self._model, self._predictor, self.stride = model, model.modules[name], stride
+
+    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        actions = hold(self._model._act(z), self.stride)
+        return self._model.force_limit_n * actions, self._predictor(z, actions)
+
+
+class _Repeat:
+    """No prediction: keep the last force until the next packet, or apply none after one step."""
+
+    def __init__(self, model: Model, *, keep: bool) -> None:
+        self._model, self.stride, self._keep = model, 1, keep
+        self._silent = torch.zeros(model.architecture["embedding"])
+
+    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        forces = hold(self._model.actor(z), 1)
+        if self._keep:
+            return forces, z
+        # The zero embedding marks "no packet since": encoded embeddings have length √D, never 0.
+        silent = (z == self._silent).all(dim=-1, keepdim=True)
+        return torch.where(silent, torch.zeros_like(forces), forces), self._silent.expand_as(z)

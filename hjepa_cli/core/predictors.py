@@ -1,0 +1,72 @@
+"""One predictor P: an embedding and the actions of its stride in, the embedding a stride later out.
+
+The same network serves all levels (paper eqs. 5-7): P^H sees z and the stride's actions; P^M and
+P^L also see the coarser prediction they interpolate towards.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from hjepa_cli.core.encoder import normalise
+
+
+class Predictor(nn.Module):
+    """MLP with one hidden layer (paper: 1024 → 256), embeddings of length √D in and out.
+
+    Args:
+        embedding: D.
+        hidden: width of the hidden layer.
+        actions: number of action inputs: the steps of the stride, or 1 where one held action
+            stands for all of them (the paper's literal reading).
+        anchored: the coarser prediction at the end of the gap is an input too (P^M, P^L).
+        distances: how many sub-strides a gap has; more than two make the remaining distance vary,
+            and then it is an input.
+        residual: predict the change from the input embedding (anchored: from the linear
+            interpolation towards the anchor) instead of the embedding itself.
+    """
+
+    def __init__(
+        self,
+        embedding: int,
+        hidden: int,
+        actions: int,
+        *,
+        anchored: bool = False,
+        distances: int = 1,
+        residual: bool = True,
+    ) -> None:
+        super().__init__()
+        self.actions, self.anchored, self.residual = actions, anchored, residual
+        self.sees_distance = anchored and distances > 2
+        inputs = embedding * (2 if anchored else 1) + actions + int(self.sees_distance)
+        self.hidden = nn.Linear(inputs, hidden)
+        self.output = nn.Linear(hidden, embedding)
+        if residual:
+            nn.init.zeros_(self.output.weight)
+            nn.init.zeros_(self.output.bias)
+
+    def forward(
+        self, z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+    ) -> Tensor:
+        """Predict one stride ahead.
+
+        Args:
+            z: embeddings [N, D] at the start of the stride.
+            actions: [N, steps] in units of the force limit; only the first ``self.actions`` of
+                them are read, so a held-action predictor takes the stride's first action.
+            anchor: coarser prediction [N, D] at the end of the gap, for anchored predictors.
+            remaining: sub-strides left to the anchor, counted from z (1 would be the anchor).
+
+        Returns:
+            Embeddings [N, D] of length √D.
+        """
+        inputs = [z, actions[..., : self.actions]]
+        start = z
+        if self.anchored:
+            assert anchor is not None, "an anchored predictor needs its anchor"
+            inputs.append(anchor)
+            start = z + (anchor - z) / remaining
+            if self.sees_distance:
+                inputs.append(torch.full_like(z[..., :1], 1.0 / remaining))
+        change: Tensor = self.output(torch.relu(self.hidden(torch.cat(inputs, dim=-1))))
+        return normalise(start + change if self.residual else change)

@@ -1,0 +1,136 @@
+"""What all training loops share: device, precision, optimiser, learning-rate schedule, finiteness."""
+
+import math
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+
+import torch
+from torch import Tensor, nn
+
+from hjepa_cli.core.actor import Actor
+from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.settings import ActorSettings
+
+WARM_UP = 0.3  # share of a one-cycle schedule spent rising
+
+
+def resolve_device(name: str) -> torch.device:
+    """``auto`` is the GPU where there is one.
+
+    Raises:
+        UsageError: ``cuda`` was asked for and is not there.
+    """
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise UsageError("--device cuda: no CUDA device is visible; choose auto or cpu")
+    return torch.device("cuda" if available and name != "cpu" else "cpu")
+
+
+def autocast(device: torch.device, precision: str) -> AbstractContextManager[object]:
+    """bf16 autocast where the hardware multiplies bf16; ``precision`` auto | bf16 | fp32."""
+    if precision == "auto":
+        precision = "bf16" if _multiplies_bf16(device) else "fp32"
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
+
+
+def _multiplies_bf16(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
+
+
+def learning_rate_factor(step: int, steps: int, schedule: str) -> float:
+    """Learning rate at ``step`` of ``steps`` ÷ its peak: ``constant``, or ``one-cycle`` in cosines.
+
+    A closed form of the step, so that a resumed run needs no scheduler state.
+    """
+    if schedule == "constant":
+        return 1.0
+    progress = step / max(steps - 1, 1)
+    if progress < WARM_UP:
+        return 0.04 + 0.96 * 0.5 * (1.0 - math.cos(math.pi * progress / WARM_UP))
+    return 0.5 * (1.0 + math.cos(math.pi * (progress - WARM_UP) / (1.0 - WARM_UP))) + 1e-4
+
+
+class Optimiser:
+    """AdamW or SGD with its schedule and gradient clipping; refuses non-finite losses.
+
+    Args:
+        parameters: what to train.
+        name: ``adamw`` | ``sgd``.
+        schedule: see :func:`learning_rate_factor`.
+        steps: length of the schedule.
+        gradient_clip: largest gradient norm.
+    """
+
+    def __init__(
+        self,
+        parameters: Iterable[nn.Parameter],
+        *,
+        name: str,
+        schedule: str,
+        steps: int,
+        learning_rate: float,
+        weight_decay: float,
+        gradient_clip: float,
+    ) -> None:
+        self.parameters = list(parameters)
+        kind = torch.optim.AdamW if name == "adamw" else torch.optim.SGD
+        self.inner = kind(self.parameters, lr=learning_rate, weight_decay=weight_decay)
+        self.schedule, self.steps, self.peak = schedule, steps, learning_rate
+        self.gradient_clip = gradient_clip
+
+    def step(self, loss: Tensor, step: int) -> None:
+        """One update at ``step``.
+
+        Raises:
+            NumericalError: the loss or its gradient is not finite.
+        """
+        rate = self.peak * learning_rate_factor(step, self.steps, self.schedule)
+        for group in self.inner.param_groups:
+            group["lr"] = rate
+        self.inner.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.gradient_clip)
+        if not torch.isfinite(norm) or not torch.isfinite(loss):
+            raise NumericalError(
+                f"training diverged at step {step} (loss {loss.item():.4g}, "
+                f"gradient norm {norm.item():.4g}, learning rate {rate:.3g})",
+                hint="lower the learning rate or train with --config precision = 'fp32'",
+            )
+        self.inner.step()
+
+
+def fit_actor(
+    z: Tensor, actions: Tensor, settings: ActorSettings, *, seed: int, epochs: int | None = None
+) -> Actor:
+    """Fit the semantic actor on frozen embeddings by AdamW on the mean squared error.
+
+    Args:
+        z: embeddings [N, D].
+        actions: teacher's labels [N] in units of the force limit.
+        epochs: fewer than ``settings.epochs`` for a quick probe.
+    """
+    torch.manual_seed(seed)
+    actor = Actor(z.shape[1], settings.hidden, settings.dropout).to(z.device)
+    batches = max(len(z) // settings.batch, 1)
+    total = batches * (epochs or settings.epochs)
+    optimiser = Optimiser(
+        actor.parameters(),
+        name="adamw",
+        schedule="one-cycle",
+        steps=total,
+        learning_rate=settings.learning_rate,
+        weight_decay=settings.weight_decay,
+        gradient_clip=1.0,
+    )
+    actor.train()
+    order = torch.empty(0, dtype=torch.long)
+    for step in range(total):
+        index = step % batches
+        if index == 0:
+            order = torch.randperm(len(z)).to(z.device)
+        chosen = order[index * settings.batch : (index + 1) * settings.batch]
+        loss = nn.functional.mse_loss(actor(z[chosen]), actions[chosen])
+        optimiser.step(loss, step)
+    return actor.eval()

@@ -1,0 +1,287 @@
+"""The flags of the command line, one type each, so that a flag means the same everywhere.
+
+A flag that overrides a setting defaults to ``None``: not given. Its default is in the preset.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hjepa_cli.checks import METHODS
+from hjepa_cli.settings import PRESETS
+
+FILES, DATA, MODEL, LOOP, RADIO = "Files", "Data", "Model", "Closed loop", "Radio cell"
+SETTINGS, SCREEN = "Settings", "Screen"
+
+
+def whole_number(minimum: int) -> Callable[[str], int]:
+    """Return a parser of whole numbers of at least ``minimum``."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = minimum - 1
+        if value < minimum:
+            raise typer.BadParameter(f"'{text}' is not a whole number of at least {minimum}")
+        return value
+
+    return parse
+
+
+def number(minimum: float) -> Callable[[str], float]:
+    """Return a parser of finite numbers of at least ``minimum``; NaN is refused."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not minimum <= value < float("inf"):
+            raise typer.BadParameter(f"'{text}' is not a finite number of at least {minimum:g}")
+        return value
+
+    return parse
+
+
+def split_names(text: str | None) -> list[str] | None:
+    """``"a, b"`` → ``["a", "b"]``, each once."""
+    if text is None:
+        return None
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
+def _setting(panel: str, flag: str, help_text: str, metavar: str, **more: Any) -> Any:
+    """A flag that overrides one value of the preset."""
+    return typer.Option(
+        flag,
+        help=help_text,
+        metavar=metavar,
+        rich_help_panel=panel,
+        show_default="from the preset",
+        **more,
+    )
+
+
+def _count(panel: str, flag: str, help_text: str, minimum: int = 1) -> Any:
+    return _setting(panel, flag, help_text, "N", parser=whole_number(minimum))
+
+
+def _one_of(panel: str, flag: str, help_text: str, *choices: str) -> Any:
+    """A flag with few values; settings.py refuses others, this offers and completes them."""
+    return _setting(panel, flag, help_text, "|".join(choices), autocompletion=lambda: list(choices))
+
+
+def _plain(panel: str, flag: str, help_text: str, **more: Any) -> Any:
+    """A flag that is no setting."""
+    return typer.Option(flag, help=help_text, rich_help_panel=panel, show_default=False, **more)
+
+
+# --- files
+
+Out = Annotated[
+    Path | None,
+    _plain(
+        FILES,
+        "--out",
+        "Directory to write to (new, empty, or an earlier run to continue). "
+        "Without it: the next free number below runs/ (collect: data/).",
+        metavar="DIR",
+    ),
+]
+Dataset = Annotated[
+    Path | None,
+    _plain(
+        FILES, "--dataset", "Dataset to read. Without it: the newest in data/.", metavar="DIR"
+    ),
+]
+Encoder = Annotated[
+    str | None,
+    _plain(
+        FILES,
+        "--encoder",
+        "Encoder to build on: a zoo name or a path. Without it: that of the newest run.",
+        metavar="NAME|PATH",
+    ),
+]
+Checkpoint = Annotated[
+    str | None,
+    _plain(
+        FILES,
+        "--checkpoint",
+        "Model to use: a zoo name or a path. Without it: the newest run's, else the zoo's.",
+        metavar="NAME|PATH",
+    ),
+]
+
+# --- data
+
+TrajectoryCount = Annotated[int | None, _count(DATA, "--trajectories", "Training trajectories.")]
+TestTrajectoryCount = Annotated[
+    int | None, _count(DATA, "--test-trajectories", "Held-out trajectories.")
+]
+TrajectorySteps = Annotated[
+    int | None, _count(DATA, "--steps", "Control steps per trajectory.", minimum=2)
+]
+Frames = Annotated[
+    str | None,
+    _one_of(
+        DATA,
+        "--frames",
+        "Render camera frames when they are read, or store them with the states.",
+        "rendered",
+        "stored",
+    ),
+]
+
+# --- model
+
+TrainingSteps = Annotated[int | None, _count(MODEL, "--steps", "Training steps of the encoder.")]
+StrideH = Annotated[
+    int | None, _count(MODEL, "--h", "Stride of the high level in control steps, a multiple of m.")
+]
+StrideM = Annotated[
+    int | None, _count(MODEL, "--m", "Stride of the medium level, a multiple of l.")
+]
+StrideL = Annotated[int | None, _count(MODEL, "--l", "Stride of the low level.")]
+Gate = Annotated[
+    bool | None,
+    typer.Option(
+        "--gate/--no-gate",
+        help="Stop with exit code 70 when the health of the encoder misses a gate, or keep it.",
+        rich_help_panel=MODEL,
+        show_default="from the preset",
+    ),
+]
+
+# --- closed loop
+
+Methods = Annotated[
+    str | None,
+    _setting(
+        LOOP,
+        "--methods",
+        f"Methods to compare, separated by commas: {', '.join(METHODS)}.",
+        "A,B,C",
+    ),
+]
+ProcessNoise = Annotated[
+    str | None,
+    _one_of(
+        LOOP,
+        "--process-noise",
+        "Noise on the two velocities, or on all four states (the paper).",
+        "velocity",
+        "isotropic",
+    ),
+]
+PlantSpread = Annotated[
+    float | None,
+    _setting(
+        LOOP,
+        "--plant-spread",
+        "Relative spread of the masses between devices; 0: all are equal.",
+        "FRACTION",
+        parser=number(0.0),
+    ),
+]
+Remeasure = Annotated[
+    bool, _plain(LOOP, "--remeasure", "Measure the closed-loop curves again, cached or not.")
+]
+Verify = Annotated[
+    bool,
+    _plain(
+        LOOP,
+        "--verify",
+        "Simulate one block at 0.9 and 1.1 of each tolerance, and check the sides of the limit.",
+    ),
+]
+
+# --- radio cell
+
+Snr = Annotated[
+    str | None,
+    _setting(
+        RADIO,
+        "--snr",
+        "Signal-to-noise ratios in dB, both ends included; step 5 unless given (10:30 is "
+        "10, 15, 20, 25, 30), or a comma list.",
+        "START:STOP[:STEP]",
+    ),
+]
+Law = Annotated[
+    str | None,
+    _one_of(
+        RADIO,
+        "--law",
+        "How devices share the band: by turns at controlled power, or all at once in equal parts.",
+        "duty",
+        "equal",
+    ),
+]
+BandwidthMhz = Annotated[
+    float | None,
+    _setting(RADIO, "--bandwidth-mhz", "Bandwidth of the cell.", "MHZ", parser=number(0.0)),
+]
+Noise = Annotated[
+    str | None,
+    _one_of(
+        RADIO,
+        "--noise",
+        "Noise power fixed (the paper), or scaled with each device's bandwidth (law equal).",
+        "fixed",
+        "scaled",
+    ),
+]
+
+# --- settings
+
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        help="Named set of values to start from.",
+        metavar="|".join(PRESETS),
+        rich_help_panel=SETTINGS,
+        show_default="default",
+        autocompletion=lambda: list(PRESETS),
+    ),
+]
+Config = Annotated[
+    Path | None,
+    _plain(
+        SETTINGS,
+        "--config",
+        "TOML file whose values override the preset's (flags override both).",
+        metavar="FILE.toml",
+    ),
+]
+PlantName = Annotated[
+    str | None,
+    _one_of(SETTINGS, "--plant", "Cart-pole to work with.", "desktop", "gym"),
+]
+Seed = Annotated[
+    int | None, _count(SETTINGS, "--seed", "Seed of everything random.", minimum=0)
+]
+Device = Annotated[
+    str | None,
+    _one_of(SETTINGS, "--device", "Where to compute; auto: cuda if there.", "auto", "cpu", "cuda"),
+]
+
+# --- screen
+
+Json = Annotated[
+    bool,
+    _plain(SCREEN, "--json", "One JSON document on stdout, everything else on stderr."),
+]
+Quiet = Annotated[bool, _plain(SCREEN, "--quiet", "Results and errors only.")]
+DryRun = Annotated[
+    bool,
+    _plain(SCREEN, "--dry-run", "Show what would be read, done and written; write nothing."),
+]
+Debug = Annotated[
+    bool,
+    _plain(SCREEN, "--debug", "Show the traceback of an error (also: HJEPA_DEBUG=1)."),
+]

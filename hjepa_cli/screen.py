@@ -1,0 +1,346 @@
+"""What the user sees: notes, tables, progress, and the one JSON document of ``--json``.
+
+Results (tables, result lines, JSON) go to stdout; everything about the work (notes, progress,
+errors) goes to stderr. Under ``json`` stdout carries the JSON document alone. Texts are printed as
+they are: rich markup in a path or a name is never interpreted, control characters are made visible.
+"""
+
+import itertools
+import json
+import math
+import shutil
+import sys
+import textwrap
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
+
+if TYPE_CHECKING:  # rich costs 80 ms; it is imported when something is drawn
+    from rich.console import Console
+    from rich.progress import Progress as RichProgress
+
+HEARTBEAT_S = 10.0
+MISSING = "-"
+FOLD_AT = 24  # a text column may be squeezed to this many characters
+GAP = 2  # blanks between columns
+
+
+class Advance(Protocol):
+    """What :meth:`Screen.progress` hands to its ``with`` block."""
+
+    def advance(self, count: int = 1, **fields: float) -> None:
+        """Count ``count`` more units; ``fields`` (``loss=0.1``) are shown beside them."""
+
+
+class Screen:
+    """The only way this program writes to the terminal.
+
+    Args:
+        quiet: show results and errors only.
+        json: everything except :meth:`emit` goes to stderr.
+        stdout, stderr: streams, for tests; by default the process's own.
+    """
+
+    def __init__(
+        self,
+        quiet: bool = False,
+        json: bool = False,
+        *,
+        stdout: TextIO | None = None,
+        stderr: TextIO | None = None,
+    ) -> None:
+        self.quiet = quiet
+        self.json = json
+        self._stdout = stdout or sys.stdout
+        self._stderr = stderr or sys.stderr
+        self._bars: RichProgress | None = None
+
+    def say(self, text: str) -> None:
+        """Print one line about the work; silent when quiet."""
+        if self.quiet:
+            return
+        if self._bars is not None:
+            self._bars.console.print(
+                one_line(text), markup=False, highlight=False, emoji=False, soft_wrap=True
+            )
+        else:
+            print(one_line(text), file=self._stderr, flush=True)
+
+    def result(self, text: str) -> None:
+        """Print one line of the outcome, also when quiet."""
+        print(one_line(text), file=self._results, flush=True)
+
+    def error(self, message: str, hint: str | None = None) -> None:
+        """Print what was wrong and, on a second line, what to do next."""
+        print(f"error: {one_line(message)}", file=self._stderr)
+        if hint:
+            print(f"hint: {one_line(hint)}", file=self._stderr)
+        self._stderr.flush()
+
+    def emit(self, document: Mapping[str, Any]) -> None:
+        """Print the JSON document of ``--json``: one line, no NaN, undefined values are null."""
+        print(json.dumps(plain(document), allow_nan=False), file=self._stdout, flush=True)
+
+    def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+        """Print a table, also when quiet.
+
+        Args:
+            title: one line above it.
+            columns: headings; they may wrap at spaces.
+            rows: cells; numbers are set right-aligned, ``None`` and NaN as ``-``. Where numbers do
+                not fit the width of the terminal, the table continues in a second block that
+                repeats the first column.
+        """
+        cells = [[_cell(value) for value in row] for row in rows]
+        lines = layout(columns, cells, shutil.get_terminal_size((80, 24)).columns)
+        print("\n".join([one_line(title), *lines]), file=self._results, flush=True)
+
+    @contextmanager
+    def progress(self, label: str, total: int, unit: str, *, done: int = 0) -> Iterator[Advance]:
+        """Show how far a loop is: a bar on a terminal, otherwise a line every ten seconds.
+
+        Args:
+            label: what is being done, one word or two.
+            total: units of work.
+            unit: their name, for the rate ("traj" → "310 traj/s").
+            done: units done before, by a run that is continued.
+        """
+        if self.quiet:
+            yield _Silent()
+        elif not _is_terminal(self._stderr):
+            heartbeat = _Heartbeat(self._stderr, label, total, unit, done)
+            yield heartbeat
+            heartbeat.finish()
+        else:
+            with self._open_bars() as bars:
+                task = bars.add_task(
+                    label, total=total, completed=done, unit=unit, rate="", fields=""
+                )
+                yield _Bar(bars, task, unit)
+                bars.refresh()
+
+    @contextmanager
+    def _open_bars(self) -> Iterator["RichProgress"]:
+        """The live display; an inner ``progress`` adds a line to the outer one's."""
+        if self._bars is not None:
+            yield self._bars
+            return
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        with Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}", markup=False),
+            TextColumn("{task.fields[fields]}", markup=False),
+            TimeRemainingColumn(elapsed_when_finished=True),
+            console=_console(self._stderr),
+        ) as bars:
+            self._bars = bars
+            try:
+                yield bars
+            finally:
+                self._bars = None
+
+    @property
+    def _results(self) -> TextIO:
+        return self._stderr if self.json else self._stdout
+
+
+class _Silent:
+    def advance(self, count: int = 1, **fields: float) -> None:
+        pass
+
+
+class _Bar:
+    """One line of the live display."""
+
+    def __init__(self, bars: "RichProgress", task: Any, unit: str) -> None:
+        self._bars, self._task, self._unit = bars, task, unit
+        self._done = 0
+        self._fields = ""
+        self._started_s = time.monotonic()
+
+    def advance(self, count: int = 1, **fields: float) -> None:
+        self._done += count
+        self._fields = _fields(fields) or self._fields
+        rate = self._done / max(time.monotonic() - self._started_s, 1e-9)
+        self._bars.update(
+            self._task,
+            advance=count,
+            rate=f"{_significant(rate)} {self._unit}/s",
+            fields=self._fields,
+        )
+
+
+class _Heartbeat:
+    """Lines for log files: one every :data:`HEARTBEAT_S` and one at the end."""
+
+    def __init__(self, stream: TextIO, label: str, total: int, unit: str, done: int) -> None:
+        self._stream, self._label, self._total, self._unit = stream, label, total, unit
+        self._done = self._before = done
+        self._fields = ""
+        self._started_s = self._printed_s = time.monotonic()
+
+    def advance(self, count: int = 1, **fields: float) -> None:
+        self._done += count
+        self._fields = _fields(fields) or self._fields
+        if time.monotonic() - self._printed_s >= HEARTBEAT_S:
+            left_s = (self._total - self._done) / max(self._rate(), 1e-9)
+            self._print(f"eta {_clock(left_s)}")
+
+    def finish(self) -> None:
+        self._print(f"in {_clock(time.monotonic() - self._started_s)}")
+
+    def _rate(self) -> float:
+        elapsed_s = time.monotonic() - self._started_s
+        return (self._done - self._before) / max(elapsed_s, 1e-9)
+
+    def _print(self, when: str) -> None:
+        self._printed_s = time.monotonic()
+        percent = 100 * self._done // max(self._total, 1)
+        line = (
+            f"{self._label} {self._done}/{self._total} ({percent} %) "
+            f"{_significant(self._rate())} {self._unit}/s {self._fields} {when}"
+        )
+        print(" ".join(one_line(line).split()), file=self._stream, flush=True)
+
+
+def one_line(text: str) -> str:
+    """Keep a text on one line and harmless: control characters become escapes (``\\n``, ``\\x1b``).
+
+    The Unicode line separators and direction overrides count as control characters too.
+    """
+    return "".join(
+        character if character.isprintable() or character == "\u00a0" else _escape(character)
+        for character in text
+    )
+
+
+def plain(value: Any) -> Any:
+    """Turn a result into JSON values: arrays to lists, paths to strings, NaN and ±inf to None.
+
+    Raises:
+        TypeError: for anything that has no JSON form.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, PurePath):
+        return str(value)
+    if hasattr(value, "tolist"):  # numpy and torch scalars and arrays
+        return plain(value.tolist())
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def _escape(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
+
+def _console(stream: TextIO) -> "Console":
+    from rich.console import Console
+
+    return Console(file=stream, highlight=False, markup=False, emoji=False)
+
+
+def _is_terminal(stream: TextIO) -> bool:
+    """Can a bar be redrawn here? FORCE_COLOR makes rich say yes for files; a file cannot."""
+    console = _console(stream)
+    return stream.isatty() and console.is_interactive and not console.is_dumb_terminal
+
+
+def layout(columns: Sequence[str], rows: Sequence[Sequence[str]], available: int) -> list[str]:
+    """Set a table as lines of at most ``available`` characters, as far as its numbers allow.
+
+    Headings wrap at spaces. Texts fold where the table would not fit otherwise; numbers never do.
+    What still does not fit goes to further blocks, each repeating the first column.
+    """
+    right = [all(_is_number(row[index]) for row in rows) for index in range(len(columns))]
+    longest = [max((len(row[index]) for row in rows), default=0) for index in range(len(columns))]
+    words = [max((len(word) for word in name.split()), default=0) for name in columns]
+    widths = [max(pair) for pair in zip(longest, words, strict=True)]
+    if sum(widths) + GAP * (len(widths) - 1) > available:
+        widths = [
+            width if number else max(word, min(width, FOLD_AT))
+            for width, word, number in zip(widths, words, right, strict=True)
+        ]
+    lines: list[str] = []
+    for block in _blocks(widths, available):
+
+        def set_row(row: Sequence[str], block: Sequence[int] = block) -> list[str]:
+            """One row as the lines its tallest cell needs."""
+            folded = [textwrap.wrap(row[i], widths[i]) or [""] for i in block]
+            return [
+                (" " * GAP)
+                .join(
+                    text.rjust(widths[i]) if right[i] else text.ljust(widths[i])
+                    for i, text in zip(block, parts, strict=True)
+                )
+                .rstrip()
+                for parts in itertools.zip_longest(*folded, fillvalue="")
+            ]
+
+        lines += [""] if lines else []
+        lines += set_row(columns)
+        lines.append("-" * (sum(widths[i] + GAP for i in block) - GAP))
+        for row in rows:
+            lines += set_row(row)
+    return lines
+
+
+def _blocks(widths: Sequence[int], available: int) -> list[list[int]]:
+    """Split columns into blocks that fit, each starting with column 0."""
+    blocks = [[0]]
+    for index in range(1, len(widths)):
+        used = sum(widths[i] + GAP for i in blocks[-1])
+        if len(blocks[-1]) > 1 and used + widths[index] > available:
+            blocks.append([0])
+        blocks[-1].append(index)
+    return blocks
+
+
+def _is_number(cell: str) -> bool:
+    """Set right-aligned: numbers, possibly with a unit or an interval after them, and blanks."""
+    first = cell.split(maxsplit=1)[:1]
+    try:
+        return not first or first[0] == MISSING or math.isfinite(float(first[0].replace(",", "")))
+    except ValueError:
+        return False
+
+
+def _cell(value: object) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return MISSING
+    if isinstance(value, float):
+        return _significant(value)
+    return one_line(str(value))
+
+
+def _significant(value: float) -> str:
+    """Three significant digits, never in exponent form: 0.0123, 1.23, 12.3, 123, 12346."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    decimals = max(0, 2 - math.floor(math.log10(abs(value))))
+    return f"{value:.{min(decimals, 6)}f}"
+
+
+def _fields(fields: Mapping[str, float]) -> str:
+    return " ".join(f"{name} {value:.3g}" for name, value in fields.items())
+
+
+def _clock(seconds: float) -> str:
+    whole = round(min(max(seconds, 0.0), 359_999.0))
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"

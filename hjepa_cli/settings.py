@@ -1,0 +1,264 @@
+"""Settings: one frozen dataclass per stage, filled from TOML presets and overridden by flags.
+
+``presets/default.toml`` holds every value and is the only place where defaults live; the other
+presets, ``--config FILE.toml`` and flags override single values of it. Precedence: flag >
+``--config`` > ``--preset`` > default.
+"""
+
+import dataclasses
+import difflib
+import math
+import tomllib
+import typing
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
+
+T = typing.TypeVar("T")
+
+PRESETS = ("default", "paper", "gym", "smoke")
+
+
+@dataclasses.dataclass(frozen=True)
+class CollectSettings:
+    """``collect``: how the dataset is made (spec §2)."""
+
+    trajectories: int
+    test_trajectories: int
+    clean_trajectories: int
+    steps: int
+    clean_steps: int
+    x_m: float  # initial states are uniform in ± these four
+    x_dot_m_s: float
+    theta_rad: float
+    theta_dot_rad_s: float
+    exploration_n: float
+    exploration_hold_steps: int
+    frames: Literal["rendered", "stored"]
+
+
+@dataclasses.dataclass(frozen=True)
+class EncoderSettings:
+    """``train-encoder``: the JEPA with its companion P^H, then the probe actor (spec §3)."""
+
+    embedding: int
+    hidden: int
+    h: int
+    frame_input: Literal["difference", "pair"]
+    stride_actions: Literal["all", "held"]
+    residual: bool
+    centre: bool
+    steps: int
+    batch_trajectories: int
+    batch_frames: int
+    rollout_steps: int
+    optimizer: Literal["adamw", "sgd"]
+    schedule: Literal["one-cycle", "constant"]
+    learning_rate: float
+    weight_decay: float
+    gradient_clip: float
+    ema_decay: float
+    inverse_dynamics: float
+    mirror: bool
+    precision: Literal["auto", "bf16", "fp32"]
+    gate: bool
+    gate_r2_x: float
+    gate_r2_x_dot: float
+    gate_r2_theta: float
+    gate_r2_theta_dot: float
+    gate_rank: float
+    gate_sensitivity: float
+    gate_actor_nrmse: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ActorSettings:
+    """The semantic actor, fitted by both training stages (spec §3)."""
+
+    hidden: int
+    dropout: float
+    learning_rate: float
+    weight_decay: float
+    batch: int
+    epochs: int
+
+
+@dataclasses.dataclass(frozen=True)
+class HierarchySettings:
+    """``train-hierarchy``: P^H, P^M, P^L and ts-jepa-1 on frozen embeddings (spec §3)."""
+
+    h: int
+    m: int
+    l: int  # noqa: E741 - the paper's symbol
+    rollout_steps: int
+    batch_trajectories: int
+    coarse_starts: int
+    flat_starts: int
+    fine_trajectories: int
+    optimizer: Literal["adamw", "sgd"]
+    schedule: Literal["one-cycle", "constant"]
+    gradient_clip: float
+    coarse_steps: int
+    coarse_learning_rate: float
+    coarse_weight_decay: float
+    medium_steps: int
+    medium_learning_rate: float
+    medium_weight_decay: float
+    low_steps: int
+    low_learning_rate: float
+    low_weight_decay: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ProtocolSettings:
+    """``eval`` and ``scale``: the closed-loop protocol (spec §4)."""
+
+    steps: int
+    curve_devices: int
+    bracket_devices: int
+    x_m: float
+    x_dot_m_s: float
+    theta_rad: float
+    theta_dot_rad_s: float
+    noise_x_dot_m_s: float  # standard deviation per control step
+    noise_theta_dot_rad_s: float
+    process_noise: Literal["velocity", "isotropic"]
+    plant_spread: float
+    payload_bits_per_value: int
+    gaps: tuple[int, ...]
+    acceptable_score: float
+    acceptable_lq_ratio: float
+    bracket: float
+    horizon: int
+    bootstrap: int
+
+
+@dataclasses.dataclass(frozen=True)
+class RadioSettings:
+    """``scale``: the radio cell (spec §5)."""
+
+    law: Literal["duty", "equal"]
+    snr_db: str
+    bandwidth_hz: float
+    noise: Literal["fixed", "scaled"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Everything that defines a run besides the paths it reads and writes."""
+
+    preset: str
+    plant: Literal["desktop", "gym"]
+    seed: int
+    device: Literal["auto", "cpu", "cuda"]
+    methods: tuple[str, ...]
+    collect: CollectSettings
+    encoder: EncoderSettings
+    actor: ActorSettings
+    hierarchy: HierarchySettings
+    protocol: ProtocolSettings
+    radio: RadioSettings
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return nested plain data, ready for JSON (tuples become lists)."""
+        return typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+
+
+def load_settings(
+    preset: str | None = None,
+    config: Path | None = None,
+    flags: Mapping[str, Any] | None = None,
+) -> Settings:
+    """Merge default < preset < config file < flags.
+
+    Args:
+        preset: one of :data:`PRESETS`; ``None`` is ``"default"``.
+        config: a TOML file of the same shape as the presets.
+        flags: dotted key (``"collect.steps"``) to value; ``None`` values were not given.
+
+    Raises:
+        UsageError: unknown preset, key or value of the wrong type, naming the valid choices.
+        MissingInputError: the config file is not there.
+        DataError: the config file is not TOML.
+    """
+    name = preset or "default"
+    if name not in PRESETS:
+        raise UsageError(f"unknown preset '{name}'; choose one of {', '.join(PRESETS)}")
+    values = _read_preset("default")
+    if name != "default":
+        _override(values, _read_preset(name), f"preset {name}")
+    if config is not None:
+        _override(values, _read_config(config), str(config))
+    for key, value in (flags or {}).items():
+        if value is not None:
+            section, _, field = key.rpartition(".")
+            _override(values, {section: {field: value}} if section else {field: value}, "flag")
+    return _build(Settings, values | {"preset": name}, "")
+
+
+def _read_preset(name: str) -> dict[str, Any]:
+    text = (resources.files("hjepa_cli") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise MissingInputError(f"config file {path} does not exist") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DataError(f"config file {path} is not readable TOML: {error}") from None
+
+
+def _override(values: dict[str, Any], changes: Mapping[str, Any], source: str) -> None:
+    """Write ``changes`` into ``values`` in place, refusing keys that default.toml does not have."""
+    for key, value in changes.items():
+        if key not in values:
+            near = difflib.get_close_matches(key, values, n=1)
+            suggestion = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(values)}"
+            raise UsageError(f"unknown setting '{key}' in {source}; {suggestion}")
+        if isinstance(values[key], dict):
+            if not isinstance(value, Mapping):
+                raise UsageError(f"'{key}' in {source} is a section, not a value")
+            _override(values[key], value, f"{source}, section [{key}]")
+        else:
+            values[key] = value
+
+
+def _build(kind: type[T], values: Mapping[str, Any], prefix: str) -> T:
+    """Instantiate a settings dataclass, checking the type of every value."""
+    hints = typing.get_type_hints(kind)
+    return kind(**{name: _convert(hints[name], values[name], prefix + name) for name in hints})
+
+
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return _build(typing.cast(type, hint), value, f"{name}.")
+    if typing.get_origin(hint) is Literal:
+        choices = typing.get_args(hint)
+        if value not in choices:
+            raise UsageError(f"{name} = {value!r}; choose one of {', '.join(choices)}")
+        return value
+    if typing.get_origin(hint) is tuple:
+        item = typing.get_args(hint)[0]
+        if not isinstance(value, list | tuple):
+            raise UsageError(f"{name} = {value!r}; expected a list")
+        return tuple(_convert(item, entry, name) for entry in value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not hint:
+        raise UsageError(f"{name} = {value!r}; expected {hint.__name__}")
+    if hint is float and not math.isfinite(value):
+        raise UsageError(f"{name} = {value}; expected a finite number")
+    return value
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
+    return value

@@ -1,0 +1,108 @@
+"""What training stages take in: a dataset that fits, its rendered frames, versions for the record."""
+
+import dataclasses
+import platform
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hjepa_cli import __version__
+from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.plant import plant
+from hjepa_cli.errors import DataError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import Settings
+from hjepa_cli.storage.datasets import Dataset, find_newest_dataset, load_dataset
+
+RENDER_CHUNK = 20  # trajectories per call, so that progress shows
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderedSplit:
+    """One split in memory, as training reads it.
+
+    Attributes:
+        frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.
+        states: float32 [N, T, 4] at k = 0 … T − 1.
+        actions: applied actions ÷ force limit [N, T].
+        labels: teacher's actions ÷ force limit [N, T].
+    """
+
+    frames: Tensor
+    states: Tensor
+    actions: Tensor
+    labels: Tensor
+
+    def pairs(self, every: int, *, mirrored: bool = False) -> Tensor:
+        """(previous, current) frames of k = 0, ``every``, …: uint8 [N · K, 2, H, W, 3]."""
+        pairs = torch.stack([self.frames[:, :-1:every], self.frames[:, 1::every]], dim=2)
+        return (pairs.flip(-2) if mirrored else pairs).flatten(0, 1)
+
+    def slice(self, start: int, stop: int) -> "RenderedSplit":
+        """Trajectories ``start`` … ``stop`` − 1."""
+        return RenderedSplit(
+            *(
+                values[start:stop]
+                for values in (self.frames, self.states, self.actions, self.labels)
+            )
+        )
+
+    def states_at(self, every: int) -> Tensor:
+        """States [N · K, 4] that go with :meth:`pairs`."""
+        return self.states[:, ::every].flatten(0, 1)
+
+    def labels_at(self, every: int) -> Tensor:
+        """Labels [N · K] that go with :meth:`pairs`."""
+        return self.labels[:, ::every].flatten()
+
+
+def open_dataset(path: Path | None, settings: Settings) -> Dataset:
+    """The dataset at ``path``, or the newest one of the settings' plant below ``data/``.
+
+    Raises:
+        MissingInputError: there is none.
+        DataError: it belongs to another plant.
+    """
+    data = load_dataset(path or find_newest_dataset(Path("data"), settings.plant))
+    if data.plant != settings.plant:
+        raise DataError(
+            f"dataset {data.path} is of plant {data.plant}, not {settings.plant}",
+            hint=f"add --plant {data.plant} or --preset {data.plant}, or pass another --dataset",
+        )
+    return data
+
+
+def render(data: Dataset, split: str, screen: Screen) -> RenderedSplit:
+    """Frames of one split, rendered now unless the dataset stores them."""
+    trajectories = data.split(split)
+    limit_n = plant(data.plant).force_limit_n
+    frames = trajectories.frames
+    if frames is None:
+        camera = Camera(plant(data.plant))
+        count = len(trajectories.states)
+        parts = []
+        with screen.progress(f"render {split}", count, "trajectories") as bar:
+            for start in range(0, count, RENDER_CHUNK):
+                chunk = trajectories.states[start : start + RENDER_CHUNK]
+                images = camera.render(chunk.reshape(-1, 4))
+                parts.append(images.reshape(*chunk.shape[:2], *images.shape[1:]))
+                bar.advance(len(chunk))
+        frames = np.concatenate(parts)
+    return RenderedSplit(
+        frames=torch.from_numpy(frames),
+        states=torch.from_numpy(trajectories.states[:, 1:].copy()),
+        actions=torch.from_numpy(trajectories.applied_n / limit_n),
+        labels=torch.from_numpy(trajectories.teacher_n / limit_n),
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions that shape the numbers, for checkpoint metadata."""
+    return {
+        "hjepa": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }

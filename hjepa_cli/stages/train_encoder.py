@@ -1,0 +1,273 @@
+"""``hjepa train-encoder``: learn Ψ and its companion P^H from rendered frames (spec §3).
+
+Dataset → encoder checkpoint. The story: render the trajectories once, train the JEPA on whole
+sub-sampled trajectories, look at the representation's health every epoch, and let the stage gates
+decide whether the result is worth handing on.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hjepa_cli.core import health
+from hjepa_cli.core.batches import FrameWindows
+from hjepa_cli.core.encoder import Encoder
+from hjepa_cli.core.jepa import Jepa
+from hjepa_cli.core.model import build_modules, encode_frames, tensors_of
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.predictors import Predictor
+from hjepa_cli.core.seeding import generator
+from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
+from hjepa_cli.errors import NumericalError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import EncoderSettings, Settings
+from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, versions
+from hjepa_cli.storage.checkpoints import save_checkpoint
+from hjepa_cli.storage.runs import Run
+
+STREAM = 2  # this stage's branch of the seed tree
+PROBE_EPOCHS = 20  # of the quick probe actor that watches training
+
+
+def run(
+    settings: Settings, screen: Screen, *, dataset: Path | None = None, out: Path | None = None
+) -> dict[str, Any]:
+    """Train, gate and save an encoder; returns the document of spec §8 ``train-encoder``.
+
+    Raises:
+        MissingInputError: no dataset.
+        NumericalError: training diverged or a gate failed (unless ``settings.encoder.gate`` is off).
+    """
+    data = open_dataset(dataset, settings)
+    with Run.create("train-encoder", out, settings) as record:
+        if record.result is not None:
+            screen.say(f"{record.directory} is finished; this is its result")
+            return record.result
+        started = time.perf_counter()
+        torch.manual_seed(settings.seed)
+        screen.say(f"dataset {data.path} ({settings.plant}), run {record.directory}")
+        train, test = (render(data, split, screen) for split in ("train", "test"))
+        architecture = describe_architecture(settings)
+        modules = build_modules(architecture)
+        encoder, companion = modules["encoder"], modules["high"]
+        assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
+        train_jepa(encoder, companion, train, test, settings, record, screen)
+
+        screen.say("measuring health on all frames and fitting the probe actor")
+        report = examine(encoder, companion, train, test, settings, every=1, epochs=None)
+        gates = judge(report, settings.encoder)
+        path = record.path("encoder.safetensors")
+        if all(gate["passed"] for gate in gates.values()) or not settings.encoder.gate:
+            metadata = {
+                "stage": "train-encoder",
+                "plant": settings.plant,
+                "architecture": architecture,
+                "settings": settings.as_dict(),
+                "dataset": data.digest,
+                "camera": data.camera,
+                "seed": settings.seed,
+                "versions": versions(),
+                "health": report,
+            }
+            save_checkpoint(path, tensors_of(modules), metadata)
+        show_gates(screen, gates)
+        if settings.encoder.gate:
+            enforce(gates)
+        result = {
+            "checkpoint": str(path),
+            "seconds": round(time.perf_counter() - started, 2),
+            "health": report,
+            "gates": gates,
+        }
+        record.finish(result)
+        screen.say(f"encoder {path} in {result['seconds']:.0f} s; next: hjepa train-hierarchy")
+        return result
+
+
+def describe_architecture(settings: Settings) -> dict[str, Any]:
+    """What :func:`build_modules` needs, as it goes into the checkpoint."""
+    encoder, hierarchy = settings.encoder, settings.hierarchy
+    return {
+        "kind": "encoder",
+        "embedding": encoder.embedding,
+        "hidden": encoder.hidden,
+        "frame_input": encoder.frame_input,
+        "centre": encoder.centre,
+        "stride_actions": encoder.stride_actions,
+        "residual": encoder.residual,
+        "h": encoder.h,
+        "m": hierarchy.m if encoder.h % hierarchy.m == 0 else 1,
+        "l": 1,
+    }
+
+
+def train_jepa(
+    encoder: Encoder,
+    companion: Predictor,
+    train: RenderedSplit,
+    test: RenderedSplit,
+    settings: Settings,
+    record: Run,
+    screen: Screen,
+) -> None:
+    """The training loop; modules are trained in place and left in evaluation mode."""
+    options = settings.encoder
+    device = resolve_device(settings.device)
+    encoder.fit_standardisation(standardisation_sample(train.frames))
+    jepa = Jepa(
+        encoder,
+        companion,
+        ema_decay=options.ema_decay,
+        inverse_dynamics=options.inverse_dynamics,
+        rollout_strides=max(options.rollout_steps // options.h, 1),
+        device=device,
+    )
+    optimiser = Optimiser(
+        jepa.parameters(),
+        name=options.optimizer,
+        schedule=options.schedule,
+        steps=options.steps,
+        learning_rate=options.learning_rate,
+        weight_decay=options.weight_decay,
+        gradient_clip=options.gradient_clip,
+    )
+    windows = FrameWindows(
+        train.frames,
+        train.actions,
+        window_frames=options.batch_frames,
+        stride=options.h,
+        mirror=options.mirror,
+    )
+    stream = generator(settings.seed, STREAM)
+    frames_per_epoch = train.actions.numel()
+    epoch_steps = max(frames_per_epoch // (options.batch_trajectories * windows.window_frames), 1)
+    with screen.progress("train-encoder", options.steps, "steps") as bar:
+        for step in range(options.steps):
+            encoder.train()
+            batch = windows.draw(options.batch_trajectories, stream)
+            with autocast(device, options.precision):
+                terms = jepa.losses(batch)
+            loss = jepa.total(terms)
+            optimiser.step(loss, step)
+            jepa.update_target()
+            bar.advance(1, loss=loss.item())
+            if (step + 1) % epoch_steps == 0:
+                report = examine(encoder, companion, train, test, settings, every=4)
+                losses = {f"loss_{name}": term.item() for name, term in terms.items()}
+                record.metric({"step": step + 1, **losses, **flatten(report)})
+    encoder.eval()
+
+
+def examine(
+    encoder: Encoder,
+    companion: Predictor,
+    train: RenderedSplit,
+    test: RenderedSplit,
+    settings: Settings,
+    *,
+    every: int,
+    epochs: int | None = PROBE_EPOCHS,
+) -> dict[str, Any]:
+    """Health of frozen embeddings (spec §3), from every ``every``-th frame of both splits.
+
+    ``epochs`` limits the probe actor's fit; ``None`` fits it in full, on mirrored frames too when
+    training is mirrored.
+    """
+    options, device = settings.encoder, resolve_device(settings.device)
+    encoder.eval()
+
+    def embed(split: RenderedSplit, *, mirrored: bool = False) -> Tensor:
+        pairs = split.pairs(every, mirrored=mirrored)
+        return encode_frames(encoder, pairs, device=device, precision=options.precision)
+
+    train_z, test_z = embed(train), embed(test)
+    train_states, test_states = train.states_at(every), test.states_at(every)
+    fit_z, fit_labels = train_z, train.labels_at(every)
+    if epochs is None and options.mirror:
+        fit_z = torch.cat([fit_z, embed(train, mirrored=True)])
+        fit_labels = torch.cat([fit_labels, -fit_labels])
+    actor = fit_actor(fit_z, fit_labels, settings.actor, seed=settings.seed, epochs=epochs)
+    per_trajectory = test_z.unflatten(0, (len(test.frames), -1))
+    ahead = options.h // every if options.h % every == 0 else 1
+    start, end = per_trajectory[:, :-ahead].flatten(0, 1), per_trajectory[:, ahead:].flatten(0, 1)
+    with torch.no_grad():
+        sensitivity = health.action_sensitivity(
+            companion.cpu().eval(), start, end, steps=options.h
+        )
+        error = health.nrmse(actor.act(test_z), test.labels_at(every))
+    companion.to(device).train()
+    return {
+        "probe_r2": health.probe_r2(train_z, train_states, test_z, test_states),
+        "effective_rank": health.effective_rank(test_z),
+        "std": float(test_z.std(0).mean()),
+        "action_sensitivity": sensitivity,
+        "actor_nrmse": error,
+    }
+
+
+def judge(report: dict[str, Any], options: EncoderSettings) -> dict[str, dict[str, Any]]:
+    """Compare the health report with the stage gates of spec §3."""
+    lower_bounds = {f"probe_r2_{name}": getattr(options, f"gate_r2_{name}") for name in health.STATE_NAMES}
+    lower_bounds |= {
+        "effective_rank": options.gate_rank,
+        "action_sensitivity": options.gate_sensitivity,
+    }
+    values = flatten(report)
+    gates = {
+        name: {"value": values[name], "threshold": bound, "passed": values[name] >= bound}
+        for name, bound in lower_bounds.items()
+    }
+    error, limit = values["actor_nrmse"], options.gate_actor_nrmse
+    gates["actor_nrmse"] = {"value": error, "threshold": limit, "passed": error <= limit}
+    return gates
+
+
+def show_gates(screen: Screen, gates: dict[str, dict[str, Any]]) -> None:
+    """One row per gate."""
+    rows = [
+        [
+            name,
+            f"{gate['value']:.3f}",
+            f"{'≤' if name == 'actor_nrmse' else '≥'} {gate['threshold']:g}",
+            "passed" if gate["passed"] else "FAILED",
+        ]
+        for name, gate in gates.items()
+    ]
+    screen.table("health, held out", ["measure", "value", "gate", ""], rows)
+
+
+def enforce(gates: dict[str, dict[str, Any]]) -> None:
+    """Stop the pipeline at a representation that cannot carry control."""
+    failed = [
+        f"{name} {gate['value']:.3f} (gate {gate['threshold']:g})"
+        for name, gate in gates.items()
+        if not gate["passed"]
+    ]
+    if failed:
+        raise NumericalError(
+            f"the encoder failed its gate: {', '.join(failed)}",
+            hint="collect more trajectories, train longer (--steps), or keep it with --no-gate",
+        )
+
+
+def flatten(report: dict[str, Any]) -> dict[str, float]:
+    """Nested health report → flat columns (``probe_r2_x``)."""
+    flat: dict[str, float] = {}
+    for name, value in report.items():
+        if isinstance(value, dict):
+            flat |= {f"{name}_{key}": entry for key, entry in value.items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def standardisation_sample(frames: Tensor, pairs: int = 512) -> Tensor:
+    """Evenly spaced (previous, current) pairs [≤ ``pairs``, 2, H, W, 3] of the training split."""
+    flat = frames.flatten(0, 1)
+    current = np.linspace(1, len(flat) - 1, min(pairs, len(flat) - 1)).astype(int)
+    current = current[current % frames.shape[1] != 0]  # the first frame has no predecessor
+    return torch.stack([flat[current - 1], flat[current]], dim=1)

@@ -1,0 +1,1 @@
+"""What lies on disk: datasets, checkpoints, run directories, the model zoo."""

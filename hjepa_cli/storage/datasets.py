@@ -1,0 +1,322 @@
+"""Datasets: trajectories of one plant in safetensors shards, described by ``dataset.json``.
+
+``dataset.json`` is written last and names every shard with its sha256, so a directory is a
+dataset only when it is complete. No time, host or path is stored: equal inputs, equal bytes.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError
+from hjepa_cli.storage import files
+from hjepa_cli.storage import tensors as arrays
+
+SCHEMA = 1
+FORMAT = "hjepa-dataset"
+MANIFEST = "dataset.json"
+SPLITS = ("train", "test", "clean")
+FRAME_SHAPE = (64, 128, 3)  # height, width, RGB
+SHARD_TRAJECTORIES = 1000
+SHARD_TRAJECTORIES_WITH_FRAMES = 50  # about 120 MB
+
+_SHARD = re.compile(r"shard-\d{5}\.safetensors")
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectories:
+    """N trajectories of T steps; index 0 of states and frames is the frame before k = 0.
+
+    The state at step k is ``states[:, k + 1]``.
+
+    Args:
+        states: float32 [N, T + 1, 4]: x (m), x_dot (m/s), theta (rad), theta_dot (rad/s).
+        applied_n: float32 [N, T], the force applied at step k (N).
+        teacher_n: float32 [N, T], the teacher's force for the state at step k (N).
+        frames: uint8 [N, T + 1, 64, 128, 3], or ``None`` if they are rendered on load.
+    """
+
+    states: np.ndarray
+    applied_n: np.ndarray
+    teacher_n: np.ndarray
+    frames: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.applied_n)
+
+    @property
+    def steps(self) -> int:
+        """T, the number of control steps of each trajectory."""
+        return int(self.applied_n.shape[1])
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return the arrays by name, without absent frames."""
+        named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: array for name, array in named.items() if array is not None}
+
+    def __getitem__(self, rows: slice) -> "Trajectories":
+        return Trajectories(**{name: array[rows] for name, array in self.tensors().items()})
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """An opened dataset directory; shards are read and verified by :meth:`split`."""
+
+    path: Path
+    plant: str
+    settings: dict[str, Any]
+    camera: dict[str, Any]
+    digest: str
+    frames: str
+    splits: dict[str, Any]
+
+    def split(self, name: str) -> Trajectories:
+        """Read one of ``train``, ``test``, ``clean``, verifying sha256, shapes and values.
+
+        Raises:
+            MissingInputError: a shard is gone.
+            DataError: a shard is truncated, changed, misshapen or not finite.
+        """
+        if name not in self.splits:
+            raise DataError(
+                f"dataset {self.path} has no split '{name}'; it has {', '.join(self.splits)}"
+            )
+        described = self.splits[name]
+        parts = [self._read_shard(shard, described["steps"]) for shard in described["shards"]]
+        joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        return Trajectories(**joined)
+
+    def _read_shard(self, shard: Mapping[str, Any], steps: int) -> dict[str, np.ndarray]:
+        path = self.path / shard["name"]
+        data = files.read_bytes(path)
+        if hashlib.sha256(data).hexdigest() != shard["sha256"]:
+            raise DataError(
+                f"{path} was changed or truncated after it was written: its sha256 does not match",
+                hint="collect the dataset again: hjepa collect",
+            )
+        tensors, _ = arrays.unpack(data, path)
+        _check(tensors, shard["trajectories"], steps, self.frames == "stored", path)
+        return tensors
+
+
+def write_dataset(
+    directory: Path,
+    *,
+    settings: Mapping[str, Any],
+    splits: Mapping[str, Trajectories],
+    plant_name: str,
+    camera_manifest: Mapping[str, Any],
+) -> Dataset:
+    """Write the splits into ``directory`` (see :func:`open_directory`), ``dataset.json`` last.
+
+    Args:
+        directory: an existing directory without a dataset.
+        settings: what the data was made with, including ``seed``; plain JSON data.
+        splits: ``train``, ``test`` and ``clean``; all with frames, or none.
+        plant_name: the plant the trajectories come from.
+        camera_manifest: the renderer's version, colours and sizes.
+
+    Raises:
+        DataError: wrong shapes or dtypes, or values that are not finite.
+        UsageError: there is a dataset in ``directory`` already.
+        StorageError: the disk refused; no dataset is left behind.
+    """
+    if (directory / MANIFEST).exists():
+        raise UsageError(f"{directory} holds a dataset already", hint="choose another --out DIR")
+    _remove_shards(directory)
+    stored = any(split.frames is not None for split in splits.values())
+    described = {}
+    number = 0
+    for name, split in splits.items():
+        _check(split.tensors(), len(split), split.steps, stored, directory / name)
+        shards = []
+        for rows in _shard_rows(len(split), stored):
+            shard = f"shard-{number:05d}.safetensors"
+            data = arrays.pack(split[rows].tensors())
+            files.write_bytes(directory / shard, data)
+            shards.append(
+                {
+                    "name": shard,
+                    "trajectories": len(split[rows]),
+                    "sha256": hashlib.sha256(data).hexdigest(),
+                }
+            )
+            number += 1
+        described[name] = {"trajectories": len(split), "steps": split.steps, "shards": shards}
+    manifest = {
+        "format": FORMAT,
+        "schema": SCHEMA,
+        "sha256": "",
+        "plant": plant_name,
+        "seed": settings.get("seed"),
+        "config": dict(settings),
+        "camera": dict(camera_manifest),
+        "frames": "stored" if stored else "rendered",
+        "splits": described,
+    }
+    manifest["sha256"] = arrays.content_digest(manifest, {})
+    files.write_json(directory / MANIFEST, manifest)
+    return load_dataset(directory)
+
+
+def load_dataset(path: Path, plant_name: str | None = None) -> Dataset:
+    """Open a dataset directory and verify its manifest.
+
+    Args:
+        path: the directory.
+        plant_name: refuse a dataset of any other plant.
+
+    Raises:
+        MissingInputError: no such directory.
+        DataError: not a dataset, changed, of a newer schema, or of another plant.
+    """
+    if not path.exists():
+        raise MissingInputError(f"dataset {path} does not exist", hint="hjepa collect")
+    if not (path / MANIFEST).is_file():
+        raise DataError(f"{path} is not an hjepa dataset: no {MANIFEST}", hint="hjepa collect")
+    manifest = files.read_json(path / MANIFEST)
+    if manifest.get("format") != FORMAT:
+        raise DataError(f"{path} is not an hjepa dataset: its {MANIFEST} is of another program")
+    schema = manifest.get("schema")
+    if type(schema) is int and schema > SCHEMA:
+        raise DataError(
+            f"dataset {path} has schema {schema}; this hjepa reads up to {SCHEMA}",
+            hint="pip install --upgrade hjepa",
+        )
+    if schema != SCHEMA:
+        raise DataError(f"dataset {path} has schema {schema!r}; expected {SCHEMA}")
+    digest = arrays.content_digest({**manifest, "sha256": ""}, {})
+    if manifest.get("sha256") != digest:
+        raise DataError(
+            f"{path / MANIFEST} was changed after it was written: its sha256 does not match",
+            hint="collect the dataset again: hjepa collect",
+        )
+    _check_manifest(manifest, path)
+    if plant_name is not None and manifest["plant"] != plant_name:
+        raise DataError(
+            f"dataset {path} belongs to plant {manifest['plant']}, not {plant_name}",
+            hint=f"hjepa collect with a preset of plant {plant_name}",
+        )
+    return Dataset(
+        path=path,
+        plant=manifest["plant"],
+        settings=manifest["config"],
+        camera=manifest["camera"],
+        digest=digest,
+        frames=manifest["frames"],
+        splits=manifest["splits"],
+    )
+
+
+@contextlib.contextmanager
+def open_directory(out: Path | None, plant_name: str, root: Path = Path("data")) -> Iterator[Path]:
+    """Create and lock the directory for a new dataset: ``out``, else ``data/<plant>-<nnnn>``.
+
+    If it holds a dataset already it is yielded as it is: check for ``dataset.json``.
+
+    Raises:
+        UsageError: ``out`` holds files that are not ours.
+        LockedError: another process collects into it.
+        StorageError: not writable.
+    """
+    if out is None:
+        directory = files.next_directory(root, f"{plant_name}-")
+    else:
+        directory = out
+        files.make_directory(directory)
+        _refuse_foreign(directory)
+    with files.lock_directory(directory):
+        yield directory
+
+
+def find_newest_dataset(root: Path, plant_name: str) -> Path | None:
+    """Return the most recently finished dataset of this plant directly under ``root``, if any."""
+    found = []
+    for name in files.list_names(root):
+        with contextlib.suppress(HjepaError, OSError):
+            load_dataset(root / name, plant_name)
+            found.append(((root / name / MANIFEST).stat().st_mtime_ns, name))
+    return root / max(found)[1] if found else None
+
+
+def _shard_rows(count: int, stored: bool) -> list[slice]:
+    size = SHARD_TRAJECTORIES_WITH_FRAMES if stored else SHARD_TRAJECTORIES
+    return [slice(start, start + size) for start in range(0, count, size)]
+
+
+def _check(
+    tensors: Mapping[str, np.ndarray], count: int, steps: int, stored: bool, where: Path
+) -> None:
+    """Demand the shapes of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
+    expected: dict[str, tuple[str, tuple[int, ...]]] = {
+        "states": ("float32", (count, steps + 1, 4)),
+        "applied_n": ("float32", (count, steps)),
+        "teacher_n": ("float32", (count, steps)),
+    }
+    if stored:
+        expected["frames"] = ("uint8", (count, steps + 1, *FRAME_SHAPE))
+    if count < 1 or steps < 1:
+        raise DataError(f"{where} holds {count} trajectories of {steps} steps; at least 1 of each")
+    if tensors.keys() != expected.keys():
+        raise DataError(f"{where} holds {sorted(tensors)}; expected {sorted(expected)}")
+    for name, (dtype, shape) in expected.items():
+        array = tensors[name]
+        if (array.dtype.name, array.shape) != (dtype, shape):
+            raise DataError(
+                f"{where}: '{name}' is {array.dtype.name} {array.shape}; expected {dtype} {shape}"
+            )
+    if bad := arrays.non_finite({key: tensors[key] for key in tensors if key != "frames"}):
+        raise DataError(f"{where}: '{bad}' holds NaN or an infinity")
+
+
+def _check_manifest(manifest: Mapping[str, Any], path: Path) -> None:
+    """Check what :class:`Dataset` relies on; shard names must not leave the directory."""
+    try:
+        good = (
+            isinstance(manifest["plant"], str)
+            and isinstance(manifest["config"], dict)
+            and isinstance(manifest["camera"], dict)
+            and manifest["frames"] in ("stored", "rendered")
+            and 0 < len(manifest["splits"].keys() & set(SPLITS)) == len(manifest["splits"])
+            and all(
+                type(split["steps"]) is int
+                and len(split["shards"]) > 0
+                and all(_SHARD.fullmatch(shard["name"]) for shard in split["shards"])
+                and all(type(shard["trajectories"]) is int for shard in split["shards"])
+                and all(isinstance(shard["sha256"], str) for shard in split["shards"])
+                for split in manifest["splits"].values()
+            )
+        )
+    except (KeyError, TypeError, AttributeError):
+        good = False
+    if not good:
+        raise DataError(f"{path / MANIFEST} lacks fields or has malformed ones")
+
+
+def _refuse_foreign(directory: Path) -> None:
+    entries = files.list_names(directory)
+    if MANIFEST in entries:
+        load_dataset(directory)  # a foreign or damaged dataset.json says so itself
+        return
+    for name in entries:
+        if name != files.LOCK_FILE and not _SHARD.fullmatch(name) and not files.is_temporary(name):
+            raise UsageError(
+                f"{directory} is not empty and not an hjepa dataset: it holds '{name}'",
+                hint="choose a new or empty directory with --out DIR",
+            )
+
+
+def _remove_shards(directory: Path) -> None:
+    """Delete the shards of a collection that was interrupted before its manifest."""
+    for name in files.list_names(directory):
+        if _SHARD.fullmatch(name):
+            try:
+                (directory / name).unlink()
+            except OSError as error:
+                raise files.storage_error(directory / name, error) from None

@@ -1,0 +1,289 @@
+"""Run directories: what a stage was asked, what happened, and the result, written last.
+
+``runs/<stage>/<nnnn>/`` holds ``config.toml`` (fully resolved, usable with ``--config``),
+``environment.json`` (stage, versions, command), ``metrics.csv`` (no time, host or path),
+``events.jsonl`` (timings), the checkpoints of the stage, and ``result.json`` once it is finished.
+"""
+
+import csv
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+from hjepa_cli import __version__
+from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.storage import files
+
+ROOT = Path("runs")
+CONFIG = "config.toml"
+ENVIRONMENT = "environment.json"
+METRICS = "metrics.csv"
+EVENTS = "events.jsonl"
+RESULT = "result.json"
+
+_PACKAGES = ("torch", "numpy", "scipy", "pymunk", "safetensors", "typer", "rich")
+
+
+class Run:
+    """A locked run directory; use it as a context manager.
+
+    Attributes:
+        directory: where everything is.
+        result: the result of a finished run, else ``None``: nothing is left to do.
+        resumed: the directory was there before, from an interrupted run.
+        differences: settings in which a finished run differs from what was asked now.
+    """
+
+    def __init__(self, directory: Path, lock: IO[bytes]) -> None:
+        self.directory = directory
+        self.result: dict[str, Any] | None = None
+        self.resumed = False
+        self.differences: list[str] = []
+        self._lock = lock
+
+    @classmethod
+    def create(
+        cls, stage: str, out: Path | None, settings: Mapping[str, Any], *, root: Path = ROOT
+    ) -> Self:
+        """Open ``out``, or a new ``runs/<stage>/<nnnn>``, for this process alone.
+
+        Args:
+            stage: the command's name.
+            out: a new or empty directory, an interrupted run to take up, or a finished one.
+            settings: resolved settings (:meth:`hjepa_cli.settings.Settings.as_dict`).
+            root: the parent of the automatic directories.
+
+        Raises:
+            UsageError: ``out`` holds something else, or an interrupted run with other settings.
+            LockedError: another process works in it.
+            StorageError: not writable.
+        """
+        if out is None:
+            directory = files.next_directory(root / stage)
+        else:
+            directory = out
+            files.make_directory(directory)
+            _refuse_foreign(directory, stage)
+        run = cls(directory, files.lock_directory(directory))
+        try:
+            run._open(stage, settings)
+        except BaseException:
+            run.close()
+            raise
+        return run
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file in this directory."""
+        return self.directory / name
+
+    def event(self, kind: str, **fields: Any) -> None:
+        """Append a line to ``events.jsonl``: time (s since 1970), kind and fields."""
+        record = {"time": round(time.time(), 3), "event": kind, **files.jsonable(fields)}
+        self._append(EVENTS, json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n")
+
+    def metric(self, row: Mapping[str, int | float | str | None]) -> None:
+        """Append a row to ``metrics.csv``; every row has the columns of the first one."""
+        columns = self._columns()
+        if columns is None:
+            self._append(METRICS, _csv_line(row))
+        elif columns != list(row):
+            raise ValueError(f"metrics.csv has columns {columns}, not {list(row)}")
+        self._append(METRICS, _csv_line([_cell(value) for value in row.values()]))
+
+    def keep_metrics(self, rows: int) -> None:
+        """Forget all but the first ``rows`` rows: those after the checkpoint taken up again."""
+        lines = _whole_lines(self.path(METRICS))
+        files.write_text(self.path(METRICS), "".join(lines[: rows + 1 if rows else 0]))
+
+    def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
+        """Write ``result.json``, which makes the run a finished one, and return what it holds."""
+        self.result = files.jsonable(result)
+        files.write_json(self.path(RESULT), self.result)
+        return self.result
+
+    def close(self) -> None:
+        """Give the directory back."""
+        self._lock.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _open(self, stage: str, settings: Mapping[str, Any]) -> None:
+        if self.path(CONFIG).exists():
+            self.resumed = True
+            self.differences = _differences(read_config(self.directory), settings)
+            if self.path(RESULT).exists():
+                self.result = files.read_json(self.path(RESULT))
+                return
+            if self.differences:
+                raise UsageError(
+                    f"{self.directory} holds an unfinished run with other settings: "
+                    + "; ".join(self.differences),
+                    hint="repeat its own settings to continue it, or choose another --out DIR",
+                )
+            for name in (METRICS, EVENTS):
+                if self.path(name).exists():  # a kill may have cut the last line
+                    files.write_text(self.path(name), "".join(_whole_lines(self.path(name))))
+            self.event("resumed")
+            return
+        files.write_json(self.path(ENVIRONMENT), environment(stage, settings))
+        files.write_text(self.path(CONFIG), to_toml(settings))
+        self.event("started")
+
+    def _columns(self) -> list[str] | None:
+        try:
+            with open(self.path(METRICS), encoding="utf-8", newline="") as file:
+                return next(csv.reader(file), None)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise files.storage_error(self.path(METRICS), error) from None
+
+    def _append(self, name: str, text: str) -> None:
+        try:
+            with open(self.path(name), "a", encoding="utf-8", newline="") as file:
+                file.write(text)
+        except OSError as error:
+            raise files.storage_error(self.path(name), error) from None
+
+
+def newest_run(
+    stage: str, predicate: Callable[[Path], bool] = lambda directory: True, root: Path = ROOT
+) -> Path | None:
+    """Return the most recently finished ``runs/<stage>/*`` that satisfies ``predicate``, if any."""
+    finished = []
+    for name in files.list_names(root / stage):
+        result = root / stage / name / RESULT
+        if result.is_file():
+            finished.append((result.stat().st_mtime_ns, name))
+    for _, name in sorted(finished, reverse=True):
+        if predicate(root / stage / name):
+            return root / stage / name
+    return None
+
+
+def read_result(directory: Path) -> dict[str, Any]:
+    """Return the result of a finished run. Raises MissingInputError or DataError."""
+    return files.read_json(directory / RESULT)
+
+
+def read_config(directory: Path) -> dict[str, Any]:
+    """Return the resolved settings of a run, without the preset's name. Raises DataError."""
+    path = directory / CONFIG
+    try:
+        return tomllib.loads(files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode())
+    except ValueError as error:
+        raise DataError(f"{path} is not valid TOML: {error}") from None
+
+
+def to_toml(settings: Mapping[str, Any]) -> str:
+    """Return settings (one level of sections) as TOML that ``--config`` accepts.
+
+    The preset is a comment: its values are all written out, and it is no setting.
+    """
+    lines = [f"# Resolved from preset {settings.get('preset', 'default')}."]
+    sections = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            sections[key] = value
+        elif key != "preset":
+            lines.append(f"{key} = {_toml(value)}")
+    for name, section in sections.items():
+        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in section.items())]
+    return "\n".join(lines) + "\n"
+
+
+def environment(stage: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a run depended on besides its settings: versions, machine, command."""
+    versions = {"hjepa": __version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return {
+        "stage": stage,
+        "preset": settings.get("preset"),
+        "command": sys.argv,
+        "versions": versions,
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "cpus": os.cpu_count(),
+    }
+
+
+def _refuse_foreign(directory: Path, stage: str) -> None:
+    entries = files.list_names(directory)
+    if CONFIG in entries:
+        other = files.read_json(directory / ENVIRONMENT).get("stage")
+        if other != stage:
+            raise UsageError(
+                f"{directory} holds a run of '{other}', not of '{stage}'",
+                hint="choose another directory with --out DIR",
+            )
+        return
+    for name in entries:
+        if name not in (files.LOCK_FILE, ENVIRONMENT) and not files.is_temporary(name):
+            raise UsageError(
+                f"{directory} is not empty and not an hjepa run: it holds '{name}'",
+                hint="choose a new or empty directory with --out DIR",
+            )
+
+
+def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Name the settings that differ, as ``section.key = old, not new``."""
+    before, after = _flat(old), _flat(files.jsonable(new))
+    return [
+        f"{key} = {before.get(key)!r}, not {after.get(key)!r}"
+        for key in sorted(before.keys() | after.keys())
+        if key != "preset" and before.get(key) != after.get(key)
+    ]
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        flat |= _flat(value, f"{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, float):
+        return repr(float(value))
+    return json.dumps(value)  # strings, integers and booleans are the same in TOML
+
+
+def _cell(value: int | float | str | None) -> str:
+    if value is None:
+        return ""
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def _csv_line(cells: Mapping[str, Any] | list[str]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerow(cells)
+    return buffer.getvalue()
+
+
+def _whole_lines(path: Path) -> list[str]:
+    text = files.read_bytes(path).decode("utf-8", errors="replace") if path.exists() else ""
+    return [line + "\n" for line in text.split("\n")[:-1]]

@@ -1,0 +1,99 @@
+"""The model zoo: trained models shipped with the program, found by name.
+
+``models/<name>/`` holds ``model.safetensors``, ``curves.json`` (its measured closed-loop curves)
+and ``README.md`` (its card). The wheel carries the folder as ``hjepa_cli/zoo``; a checkout and an
+editable install have it beside the package.
+"""
+
+import dataclasses
+import difflib
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.storage import files
+from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
+
+CURVES_FILE = "curves.json"
+CARD_FILE = "README.md"
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
+
+
+@dataclasses.dataclass(frozen=True)
+class ZooModel:
+    """A verified model: its checkpoint's metadata, and whether its measured curves belong to it."""
+
+    name: str
+    path: Path
+    size_bytes: int
+    digest: str
+    metadata: dict[str, Any]
+    has_curves: bool
+
+
+def zoo_directory() -> Path:
+    """Return the folder with the shipped models; it may be absent in a bare checkout."""
+    packaged = Path(str(resources.files("hjepa_cli") / "zoo"))
+    return packaged if packaged.is_dir() else Path(__file__).parents[2] / "models"
+
+
+def list_models() -> list[str]:
+    """Return the names of the shipped models, sorted."""
+    root = zoo_directory()
+    names = filter(_NAME.fullmatch, files.list_names(root))
+    return [name for name in names if (root / name / MODEL_FILE).is_file()]
+
+
+def resolve_model(name_or_path: str | Path) -> Path:
+    """Return the checkpoint file of a zoo name, a run directory or a file.
+
+    A zoo name wins over a file of the same name in the current directory; write ``./name`` for
+    the file.
+
+    Raises:
+        MissingInputError: neither; the message lists the zoo's names.
+    """
+    text = str(name_or_path)
+    models = list_models()
+    if text in models:
+        return zoo_directory() / text / MODEL_FILE
+    path = Path(name_or_path)
+    if path.is_dir():
+        if (path / MODEL_FILE).is_file():
+            return path / MODEL_FILE
+        raise MissingInputError(
+            f"{path} holds no {MODEL_FILE}: not a finished training run",
+            hint="name a run directory, a .safetensors file or a zoo model: hjepa models list",
+        )
+    if path.exists():
+        return path
+    near = difflib.get_close_matches(text, models, n=1)
+    suggestion = f"did you mean '{near[0]}'?" if near else f"the zoo has {', '.join(models) or '-'}"
+    raise MissingInputError(
+        f"no model '{text}': neither a zoo name nor a file; {suggestion}", hint="hjepa models list"
+    )
+
+
+def verify_model(name_or_path: str | Path) -> ZooModel:
+    """Load a model, check its sha256 and that ``curves.json`` beside it was measured on it.
+
+    Raises:
+        MissingInputError: no such model.
+        DataError: damaged, or the curves belong to another checkpoint.
+    """
+    path = resolve_model(name_or_path)
+    checkpoint = load_checkpoint(path)
+    curves = path.with_name(CURVES_FILE)
+    if curves.exists():
+        digest = files.read_json(curves).get("digest")
+        if not isinstance(digest, dict) or digest.get("checkpoint") != checkpoint.digest:
+            raise DataError(
+                f"{curves} was measured on another checkpoint than {path.name}",
+                hint=f"measure it again: hjepa eval --checkpoint {name_or_path} --remeasure",
+            )
+    name = path.parent.name if path.name == MODEL_FILE else path.stem
+    size = path.stat().st_size
+    return ZooModel(name, path, size, checkpoint.digest, checkpoint.metadata, curves.exists())
