@@ -5,10 +5,11 @@ at once. Defaults live in ``presets/default.toml``, not in the signatures below:
 given is ``None`` and changes nothing.
 """
 
+import io
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -16,31 +17,23 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.main import get_command
 
-from hjepa_cli import __version__
-from hjepa_cli.checks import METHODS, check_settings
-from hjepa_cli.errors import HjepaError, StorageError
-from hjepa_cli.plan import Plan, plan_stage
+from hjepa_cli import __version__, options, plan
+from hjepa_cli.checks import check_settings
+from hjepa_cli.errors import HjepaError, StorageError, UsageError
 from hjepa_cli.screen import Screen, one_line
-from hjepa_cli.settings import PRESETS, Settings, load_settings
+from hjepa_cli.settings import Settings, load_settings
 
 Result = dict[str, Any]
 
-PIPELINE = (
-    "hjepa collect --trajectories 200 | hjepa train-encoder | "
-    "hjepa train-hierarchy --h 4 --m 2 --l 1 | hjepa eval | hjepa scale --snr 10:30"
-)
+PIPELINE = "Pipeline"
+STAGES = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
 
 app = typer.Typer(
-    help="Semantic predictive control over radio links with a hierarchical JEPA: how many "
-    "cart-poles does one radio cell support when a predictive world model drives them?",
-    epilog="The five stages, in order: collect, train-encoder, train-hierarchy, eval, scale. "
-    "eval and scale also work on their own, with a trained model of the zoo.",
-    rich_markup_mode=None,
-    add_completion=True,
+    help="How many cart-poles does one radio cell support when a hierarchical JEPA drives them? "
+    f"The stages, in order: {', '.join(STAGES)}. The last two also work alone, on a zoo model.",
+    pretty_exceptions_enable=False,
 )
-models_app = typer.Typer(
-    help="List, describe and verify trained models.", rich_markup_mode=None, no_args_is_help=True
-)
+models_app = typer.Typer(help="List, describe and verify trained models.")
 app.add_typer(models_app, name="models", rich_help_panel="Models")
 
 
@@ -50,60 +43,383 @@ class Interrupted(HjepaError):
     exit_code = 130
 
 
-# --- options: one type per flag, so that each has one help text -----------------------------------
+class PipeClosed(HjepaError):
+    """Whoever read our output has gone, as in ``hjepa scale | head -1``: end without a word."""
+
+    exit_code = StorageError.exit_code
 
 
-def _whole_number(minimum: int) -> Callable[[str], int]:
-    """Parser of whole numbers of at least ``minimum``."""
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the program and exit: the only place where an error becomes a line and a code.
 
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = minimum - 1
-        if value < minimum:
-            raise typer.BadParameter(f"'{text}' is not a whole number of at least {minimum}")
-        return value
-
-    return parse
+    Args:
+        arguments: command line without the program's name; by default that of the process.
+    """
+    argv = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # an ASCII-only terminal gets "?", not a crash
+            stream.reconfigure(errors="replace")
+    sys.exit(_run_command(argv))
 
 
-def _number(minimum: float) -> Callable[[str], float]:
-    """Parser of finite numbers of at least ``minimum``; NaN and infinities are refused."""
+def _run_command(argv: list[str]) -> int:
+    """Run one command; return the exit code after reporting any error."""
+    try:
+        returned = get_command(app).main(argv, prog_name="hjepa", standalone_mode=False)
+        return returned if isinstance(returned, int) else 0
+    except Exception as error:  # the last resort of a command line
+        if "--debug" in argv or os.environ.get("HJEPA_DEBUG", "0") not in ("", "0"):
+            traceback.print_exc()
+        failure = _expected(error, argv)
+    if isinstance(failure, PipeClosed):  # keep Python from complaining about its last flush
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return failure.exit_code
+    screen = Screen(json="--json" in argv)
+    screen.error(failure.message, failure.hint)
+    if screen.json:
+        message, hint = one_line(failure.message), failure.hint
+        screen.emit({"error": {"code": failure.exit_code, "message": message, "hint": hint}})
+    return failure.exit_code
 
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not minimum <= value < float("inf"):
-            raise typer.BadParameter(f"'{text}' is not a finite number of at least {minimum:g}")
-        return value
 
-    return parse
-
-
-def _choices(*choices: str) -> Callable[[str], list[str]]:
-    """Shell completion from a fixed list."""
-    return lambda incomplete: [choice for choice in choices if choice.startswith(incomplete)]
-
-
-def _option(panel: str, flag: str, help_text: str, metavar: str | None = None, **more: Any) -> Any:
-    return typer.Option(
-        flag, help=help_text, metavar=metavar, rich_help_panel=panel, show_default=False, **more
+def _expected(error: Exception, argv: list[str]) -> HjepaError:
+    """Every exception as one of ours: a message, a hint and an exit code."""
+    command = next((word for word in argv if word in (*STAGES, "models")), None)
+    usage = f"hjepa {command} --help" if command else f"commands: {', '.join(STAGES)}, models"
+    if isinstance(error, HjepaError):
+        if isinstance(error, UsageError):
+            error.hint = error.hint or usage
+        return error
+    if isinstance(error, typer.TyperException):
+        return UsageError(" ".join(error.format_message().split()), hint=usage)
+    if isinstance(error, OSError):
+        where = f": {error.filename}" if error.filename else ""
+        return StorageError(
+            f"{error.strerror or error}{where}", hint="check the path, its permissions and the disk"
+        )
+    first_line = next(iter(str(error).splitlines()), "")
+    return HjepaError(
+        f"unexpected {type(error).__name__}: {first_line}",
+        hint="run it again with --debug (or HJEPA_DEBUG=1) to see the traceback, and report it",
     )
 
 
-DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
-FILES, SETTINGS, OUTPUT = "Files", "Settings", "Screen"
+def _settings(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -> Settings:
+    """Merge preset, file and flags; refuse values that make no sense before anything is touched."""
+    settings = load_settings(preset, config, flags)
+    check_settings(settings)
+    return settings
 
-Trajectories = Annotated[
-    int | None,
-    _option(
-        DATA, "--trajectories", "Training trajectories.", "N", parser=_whole_number(1)
-    ),
-]
-TestTrajectories = Annotated[
-    int | None,
-    _option(DATA, "--test-trajectories", "Held-out trajectories.", "N", parser=_whole_number(1)),
-]
+
+def _execute(
+    screen: Screen,
+    stage: Callable[[], Result],
+    planned: Callable[[], plan.Plan],
+    *,
+    dry_run: bool,
+) -> None:
+    """Run a stage, or show its plan, and print what it returns."""
+    with _guard():
+        if dry_run:
+            planned().show(screen)
+            return
+        result = stage()
+        if screen.json:
+            screen.emit(result)
+        elif screen.quiet:  # otherwise the stage has said where its result is
+            for name in ("dataset", "checkpoint"):
+                if name in result:
+                    screen.result(str(result[name]))
+
+
+@contextmanager
+def _guard() -> Iterator[None]:
+    """Catch what Typer would turn into exit codes of its own."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(
+            "interrupted", hint="the same command with --out and its run directory takes it up"
+        ) from None
+    except BrokenPipeError:
+        raise PipeClosed("output closed") from None
+
+
+def _print_help(context: typer.Context) -> None:
+    """A command group on its own shows its help."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+        raise typer.Exit()
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"hjepa {__version__}")
+        raise typer.Exit()
+
+
+# --- commands -------------------------------------------------------------------------------------
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            help="Print the version.",
+            rich_help_panel=options.SCREEN,
+            callback=_print_version,
+            is_eager=True,
+            show_default=False,
+        ),
+    ] = False,
+) -> None:
+    _print_help(context)
+
+
+@app.command(rich_help_panel=PIPELINE)
+def collect(
+    trajectories: options.TrajectoryCount = None,
+    test_trajectories: options.TestTrajectoryCount = None,
+    steps: options.TrajectorySteps = None,
+    frames: options.Frames = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Simulate cart-poles under an exploring teacher and store them as a dataset."""
+    settings = _settings(
+        preset,
+        config,
+        {
+            "plant": plant,
+            "seed": seed,
+            "collect.trajectories": trajectories,
+            "collect.test_trajectories": test_trajectories,
+            "collect.steps": steps,
+            "collect.frames": frames,
+        },
+    )
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages import collect as module
+
+        return module.run(settings, screen, out=out)
+
+    _execute(screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run)
+
+
+@app.command("train-encoder", rich_help_panel=PIPELINE)
+def train_encoder(
+    h: options.StrideH = None,
+    steps: options.TrainingSteps = None,
+    gate: options.Gate = None,
+    dataset: options.Dataset = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Learn an encoder of camera frames with a joint-embedding predictive objective."""
+    settings = _settings(
+        preset,
+        config,
+        {
+            "plant": plant,
+            "seed": seed,
+            "device": device,
+            "encoder.h": h,
+            "encoder.steps": steps,
+            "encoder.gate": gate,
+        },
+    )
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages import train_encoder as module
+
+        return module.run(settings, screen, dataset=dataset, out=out)
+
+    _execute(
+        screen, stage, lambda: plan.plan_train_encoder(settings, dataset, out), dry_run=dry_run
+    )
+
+
+@app.command("train-hierarchy", rich_help_panel=PIPELINE)
+def train_hierarchy(
+    h: options.StrideH = None,
+    m: options.StrideM = None,
+    l: options.StrideL = None,  # noqa: E741 - the paper's symbol
+    dataset: options.Dataset = None,
+    encoder: options.Encoder = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Train the three predictors of the hierarchy, the flat baseline and the semantic actor."""
+    settings = _settings(
+        preset,
+        config,
+        {
+            "plant": plant,
+            "seed": seed,
+            "device": device,
+            "hierarchy.h": h,
+            "hierarchy.m": m,
+            "hierarchy.l": l,
+        },
+    )
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages import train_hierarchy as module
+
+        return module.run(settings, screen, dataset=dataset, encoder=encoder, out=out)
+
+    _execute(
+        screen,
+        stage,
+        lambda: plan.plan_train_hierarchy(settings, dataset, encoder, out),
+        dry_run=dry_run,
+    )
+
+
+@app.command("eval", rich_help_panel=PIPELINE)
+def evaluate(
+    methods: options.Methods = None,
+    process_noise: options.ProcessNoise = None,
+    plant_spread: options.PlantSpread = None,
+    remeasure: options.Remeasure = False,
+    checkpoint: options.Checkpoint = None,
+    dataset: options.Dataset = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Measure prediction error, control score and tolerated losses of each method."""
+    settings = _settings(
+        preset,
+        config,
+        {
+            "plant": plant,
+            "seed": seed,
+            "device": device,
+            "methods": options.split_names(methods),
+            "protocol.process_noise": process_noise,
+            "protocol.plant_spread": plant_spread,
+        },
+    )
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages import evaluate as module
+
+        return module.run(
+            settings, screen, checkpoint=checkpoint, dataset=dataset, out=out, remeasure=remeasure
+        )
+
+    _execute(
+        screen,
+        stage,
+        lambda: plan.plan_eval(settings, checkpoint, dataset, out, remeasure=remeasure),
+        dry_run=dry_run,
+    )
+
+
+@app.command(rich_help_panel=PIPELINE)
+def scale(
+    snr: options.Snr = None,
+    law: options.Law = None,
+    bandwidth_mhz: options.BandwidthMhz = None,
+    noise: options.Noise = None,
+    methods: options.Methods = None,
+    process_noise: options.ProcessNoise = None,
+    plant_spread: options.PlantSpread = None,
+    remeasure: options.Remeasure = False,
+    verify: options.Verify = False,
+    checkpoint: options.Checkpoint = None,
+    dataset: options.Dataset = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Count the devices that one radio cell supports, by method and signal-to-noise ratio."""
+    settings = _settings(
+        preset,
+        config,
+        {
+            "plant": plant,
+            "seed": seed,
+            "device": device,
+            "methods": options.split_names(methods),
+            "protocol.process_noise": process_noise,
+            "protocol.plant_spread": plant_spread,
+            "radio.snr_db": snr,
+            "radio.law": law,
+            "radio.bandwidth_hz": None if bandwidth_mhz is None else bandwidth_mhz * 1e6,
+            "radio.noise": noise,
+        },
+    )
+    screen = Screen(quiet, as_json)
+    with _guard():
+        from hjepa_cli.core.capacity import parse_snr
+
+        snr_db = parse_snr(settings.radio.snr_db)
+
+    def stage() -> Result:
+        from hjepa_cli.stages import scale as module
+
+        return module.run(
+            settings,
+            screen,
+            checkpoint=checkpoint,
+            dataset=dataset,
+            out=out,
+            remeasure=remeasure,
+            verify=verify,
+        )
+
+    _execute(
+        screen,
+        stage,
+        lambda: plan.plan_scale(
+            settings, checkpoint, out, snr_db, remeasure=remeasure, verify=verify
+        ),
+        dry_run=dry_run,
+    )

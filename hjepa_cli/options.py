@@ -93,9 +93,7 @@ Out = Annotated[
 ]
 Dataset = Annotated[
     Path | None,
-    _plain(
-        FILES, "--dataset", "Dataset to read. Without it: the newest in data/.", metavar="DIR"
-    ),
+    _plain(FILES, "--dataset", "Dataset to read. Without it: the newest in data/.", metavar="DIR"),
 ]
 Encoder = Annotated[
     str | None,
@@ -262,9 +260,7 @@ PlantName = Annotated[
     str | None,
     _one_of(SETTINGS, "--plant", "Cart-pole to work with.", "desktop", "gym"),
 ]
-Seed = Annotated[
-    int | None, _count(SETTINGS, "--seed", "Seed of everything random.", minimum=0)
-]
+Seed = Annotated[int | None, _count(SETTINGS, "--seed", "Seed of everything random.", minimum=0)]
 Device = Annotated[
     str | None,
     _one_of(SETTINGS, "--device", "Where to compute; auto: cuda if there.", "auto", "cpu", "cuda"),

@@ -11,7 +11,7 @@ from torch import Tensor
 from hjepa_cli import __version__
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.plant import plant
-from hjepa_cli.errors import DataError
+from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage.datasets import Dataset, find_newest_dataset, load_dataset
@@ -65,7 +65,13 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
         MissingInputError: there is none.
         DataError: it belongs to another plant.
     """
-    data = load_dataset(path or find_newest_dataset(Path("data"), settings.plant))
+    path = path or find_newest_dataset(Path("data"), settings.plant)
+    if path is None:
+        raise MissingInputError(
+            f"no dataset of plant {settings.plant} below data/",
+            hint=f"hjepa collect --plant {settings.plant}, or pass --dataset DIR",
+        )
+    data = load_dataset(path)
     if data.plant != settings.plant:
         raise DataError(
             f"dataset {data.path} is of plant {data.plant}, not {settings.plant}",

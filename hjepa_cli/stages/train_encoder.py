@@ -26,7 +26,7 @@ from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import EncoderSettings, Settings
 from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, versions
-from hjepa_cli.storage.checkpoints import save_checkpoint
+from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 from hjepa_cli.storage.runs import Run
 
 STREAM = 2  # this stage's branch of the seed tree
@@ -43,7 +43,7 @@ def run(
         NumericalError: training diverged or a gate failed (unless ``settings.encoder.gate`` is off).
     """
     data = open_dataset(dataset, settings)
-    with Run.create("train-encoder", out, settings) as record:
+    with Run.create("train-encoder", out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
             return record.result
@@ -60,7 +60,7 @@ def run(
         screen.say("measuring health on all frames and fitting the probe actor")
         report = examine(encoder, companion, train, test, settings, every=1, epochs=None)
         gates = judge(report, settings.encoder)
-        path = record.path("encoder.safetensors")
+        path = record.path(MODEL_FILE)
         if all(gate["passed"] for gate in gates.values()) or not settings.encoder.gate:
             metadata = {
                 "stage": "train-encoder",
@@ -83,7 +83,7 @@ def run(
             "health": report,
             "gates": gates,
         }
-        record.finish(result)
+        result = record.finish(result)
         screen.say(f"encoder {path} in {result['seconds']:.0f} s; next: hjepa train-hierarchy")
         return result
 

@@ -19,12 +19,13 @@ from hjepa_cli.core.levels import EmbeddedTrajectories
 from hjepa_cli.core.model import Model, build_modules, encode_frames, load_modules, tensors_of
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import Optimiser, fit_actor, resolve_device
-from hjepa_cli.errors import DataError
+from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, versions
-from hjepa_cli.storage.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from hjepa_cli.storage.runs import Run, newest_run
+from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
+from hjepa_cli.storage.runs import Run, newest_run, read_config
+from hjepa_cli.storage.zoo import resolve_model
 
 STREAM = 3  # this stage's branch of the seed tree
 REPORT_EVERY = 50  # steps between rows of metrics.csv
@@ -49,7 +50,7 @@ def run(
     strides = Strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
     data = open_dataset(dataset, settings)
     source = open_encoder(encoder, settings)
-    with Run.create("train-hierarchy", out, settings) as record:
+    with Run.create("train-hierarchy", out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
             return record.result
@@ -82,7 +83,7 @@ def run(
             "versions": versions(),
             "health": source.metadata["health"],
         }
-        path = record.path("model.safetensors")
+        path = record.path(MODEL_FILE)
         digest = save_checkpoint(path, tensors_of(modules), metadata)
         model = Model(modules, metadata, digest, settings.device)
         result = {
@@ -91,7 +92,7 @@ def run(
             "seconds": round(time.perf_counter() - started, 2),
             "nmae_windows": nmae_windows(model, settings),
         }
-        record.finish(result)
+        result = record.finish(result)
         screen.say(f"model {path} in {result['seconds']:.0f} s; next: hjepa eval")
         return result
 
@@ -105,10 +106,15 @@ def open_encoder(name: str | None, settings: Settings) -> Checkpoint:
     """
     if name is None:
         directory = newest_run(
-            "train-encoder", lambda result, resolved: resolved["plant"] == settings.plant
+            "train-encoder", lambda run: read_config(run)["plant"] == settings.plant
         )
-        name = str(directory / "encoder.safetensors")
-    checkpoint = load_checkpoint(Path(name))
+        if directory is None:
+            raise MissingInputError(
+                f"no finished train-encoder run of plant {settings.plant} below runs/",
+                hint="hjepa train-encoder, or pass --encoder PATH",
+            )
+        name = str(directory)
+    checkpoint = load_checkpoint(resolve_model(name))
     if checkpoint.metadata["plant"] != settings.plant:
         raise DataError(
             f"encoder {checkpoint.path} was trained on plant {checkpoint.metadata['plant']}, "

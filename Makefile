@@ -1,0 +1,27 @@
+# make demo   how many cart-poles a radio cell supports: installs, prints the table, draws the figure
+# make test   installs and runs the tests; make test ARGS='-k camera' runs some
+# make lint   ruff on everything, mypy --strict on hjepa_cli/core
+# make clean  removes .venv and what tools leave behind
+#
+# PYTHON=python3.12 chooses the interpreter (3.11 or newer).
+
+export PYTHON ?= python3
+ARGS ?=
+
+.PHONY: demo test lint clean
+
+demo:
+	@scripts/venv plot
+	.venv/bin/hjepa scale --snr 10:30 $(ARGS)
+
+test:
+	@scripts/venv test
+	.venv/bin/python -m pytest $(ARGS)
+
+lint:
+	@scripts/venv lint
+	.venv/bin/ruff check .
+	.venv/bin/mypy
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache dist

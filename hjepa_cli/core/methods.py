@@ -1,0 +1,110 @@
+"""What each method name means: what its devices send, and what its controller does with it.
+
+Methods on embeddings send Ψ(previous frame, current frame), really rendered, encoded, quantised
+and dequantised. Methods on the true state are anchors: what prediction could gain at best
+(``oracle``), what it has to beat (``hold-true``, ``zero-true``), and the teacher (``optimal``).
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
+from hjepa_cli.core.dynamics import rk4_step
+from hjepa_cli.core.loop import Controller, Floats, Sensor
+from hjepa_cli.core.payload import payload_bits, quantise
+from hjepa_cli.core.plant import Plant, plant
+from hjepa_cli.core.policy import teacher
+
+if TYPE_CHECKING:
+    from hjepa_cli.core.model import Model
+
+TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
+SENSOR_BATCH = 256  # frame pairs rendered and encoded at a time: 12 MiB
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """One way to drive the devices.
+
+    Attributes:
+        name: as on the command line.
+        sensor: what a device sends.
+        controller: builds a fresh controller for n devices.
+        bits_per_transmission: what a transmission costs; ``None`` where nothing is transmitted.
+        family: methods of one family play the same when a packet arrives at every step.
+    """
+
+    name: str
+    sensor: Sensor
+    controller: Callable[[int], Controller]
+    bits_per_transmission: int | None
+    family: str
+
+
+def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Method:
+    """One of :data:`TRUE_STATE`.
+
+    Args:
+        name: the method.
+        kind: the nominal plant: its teacher and, for the oracle, its equations.
+        bits_per_transmission: counted as if embeddings were sent, so that device counts differ
+            by control alone. ``optimal`` does not use the link.
+    """
+    act = teacher(kind)
+    build: Callable[[int], Controller]
+    if name == "oracle":
+        advance = functools.partial(_advance, kind)
+        build = functools.partial(Oracle, act, advance, kind.force_limit_n)
+    else:
+        build = functools.partial(LastForce, act, keep=name != "zero-true")
+    bits = None if name == "optimal" else bits_per_transmission
+    return Method(name, true_state, build, bits, "state")
+
+
+def embedding_method(name: str, model: "Model", bits_per_value: int) -> Method:
+    """A method that lives on a trained model's embeddings.
+
+    Raises:
+        UsageError: the model does not hold this method.
+    """
+    build: Callable[[int], Controller]
+    if name in ("hold", "zero"):
+        build = functools.partial(LastForce, model.actor, keep=name == "hold")
+    else:
+        build = functools.partial(StrideController, model.planner(name))
+    bits = payload_bits(model.architecture["embedding"], bits_per_value)
+    return Method(name, embedding_sensor(model, bits_per_value), build, bits, "embedding")
+
+
+def true_state(previous: Floats, states: Floats) -> Floats:
+    """Sensor: the state itself, exact."""
+    return states
+
+
+def embedding_sensor(model: "Model", bits_per_value: int) -> Callable[[Floats, Floats], Tensor]:
+    """Sensor: render the last two frames, encode, quantise, dequantise."""
+    camera = Camera(plant(model.plant_name))
+
+    def sense(previous: Floats, states: Floats) -> Tensor:
+        """States [m, 4] one step before and now → received embeddings [m, D]."""
+        parts = []
+        for start in range(0, len(states), SENSOR_BATCH):
+            chunk = slice(start, start + SENSOR_BATCH)
+            pair = np.stack([previous[chunk], states[chunk]], axis=1)
+            frames = camera.render(pair.reshape(-1, 4))
+            z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
+            parts.append(quantise(z, bits_per_value))
+        return torch.cat(parts).to(model.device)
+
+    return sense
+
+
+def _advance(kind: Plant, states: Floats, forces_n: Floats) -> Floats:
+    return rk4_step(kind, states, forces_n, kind.step_s)

@@ -1,0 +1,277 @@
+"""The measuring protocol: curves over the gap and over the delivery probability, and tolerances.
+
+A curve is measured on a grid with few devices; where it crosses the acceptable score it is
+measured again with more, bisecting until the crossing is bracketed to a few per cent (spec §4).
+Both curves live on one axis, the mean gap g between packets in steps: D = g for the gap curve,
+p = 1/g for the delivery curve, whose crossing is interpolated in ln p instead of in D.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hjepa_cli.core import metrics
+from hjepa_cli.core.loop import Draws, Outcome, delivery_schedule, gap_schedule
+from hjepa_cli.settings import ProtocolSettings
+
+Floats = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """One point of a curve: a link with mean gap ``gap`` between packets, in steps.
+
+    Attributes:
+        kind: ``"gap"``: every D = ``gap`` steps; ``"delivery"``: with p = 1/``gap`` at each.
+    """
+
+    kind: str
+    gap: float
+
+    def schedule(self, draws: Draws) -> NDArray[np.bool_]:
+        """When packets arrive: bool [steps, N]."""
+        if self.kind == "gap":
+            return gap_schedule(self.gap, draws.steps, draws.devices)
+        return delivery_schedule(1 / self.gap, draws.delivery)
+
+    def coordinate(self) -> dict[str, float]:
+        """``{"d": D}`` or ``{"p": p}``, as curves are printed."""
+        return {"d": self.gap} if self.kind == "gap" else {"p": 1 / self.gap}
+
+
+Measure = Callable[[Sequence[Point], int], Outcome]
+"""Simulates points with the first ``devices`` draws: outcome arrays [P, devices]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """The teacher, acting on the true state at every step, on the same draws.
+
+    Attributes:
+        score, cost: [N], all bracket devices.
+        seed: of the bootstrap.
+    """
+
+    score: Floats
+    cost: Floats
+    replicates: int
+    seed: int
+
+    def weights(self, devices: int) -> Floats:
+        """Bootstrap weights [B, devices], the same whenever asked."""
+        return metrics.bootstrap_weights(devices, self.replicates, self.seed)
+
+    def relative_score(self, outcome: Outcome) -> Floats:
+        """Normalised score of each point [P]."""
+        return metrics.ratio(outcome.score, self.score[: outcome.score.shape[1]])
+
+    def score_replicates(self, outcome: Outcome) -> Floats:
+        """Bootstrap replicates of the normalised score [B, P]."""
+        devices = outcome.score.shape[1]
+        return metrics.ratio(outcome.score, self.score[:devices], self.weights(devices))
+
+    def relative_cost(self, outcome: Outcome) -> Floats:
+        """LQ ratio of each point [P]: J of the teacher ÷ J of the method."""
+        return self.cost[: outcome.cost.shape[1]].mean() / outcome.cost.mean(axis=1)
+
+    def describe(self, points: Sequence[Point], outcome: Outcome) -> list[dict[str, Any]]:
+        """Curve entries as printed: coordinate, score, its interval, LQ ratio, devices."""
+        scores = self.relative_score(outcome)
+        low, high = metrics.interval(self.score_replicates(outcome))
+        costs = self.relative_cost(outcome)
+        return [
+            {
+                **point.coordinate(),
+                "score": float(scores[i]),
+                "ci95": [float(low[i]), float(high[i])],
+                "lq_ratio": float(costs[i]),
+                "n_devices": outcome.score.shape[1],
+            }
+            for i, point in enumerate(points)
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """How sparse packets may get before the score falls below the acceptable one.
+
+    Attributes:
+        gap: mean gap in steps; 0 where not even a packet at every step suffices, the end of the
+            grid where the score is still acceptable there (``censored``).
+        interval: its 95 % interval, within the same two ends.
+    """
+
+    gap: float
+    interval: tuple[float, float]
+    censored: bool
+
+
+class Search:
+    """Finds the crossing of one curve: asks for points, takes their outcomes, until content.
+
+    The grid's values from few devices guide the search. Whatever decides the result is measured
+    with many: both ends of the final bracket, and the points that the interval needs.
+
+    Args:
+        kind: see :class:`Point`.
+        grid: ascending mean gaps.
+        grid_scores: normalised scores of the grid with few devices.
+        reference: the teacher with many devices.
+        protocol: acceptable score and bracket width.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        grid: Sequence[float],
+        grid_scores: Floats,
+        reference: Reference,
+        protocol: ProtocolSettings,
+    ) -> None:
+        self.kind = kind
+        self._grid = {float(gap): float(score) for gap, score in zip(grid, grid_scores, strict=True)}
+        self._measured: dict[float, tuple[Floats, Floats]] = {}
+        self._reference = reference
+        self._level, self._bracket = protocol.acceptable_score, protocol.bracket
+
+    @property
+    def points(self) -> list[Point]:
+        """The points measured so far, ascending."""
+        return [Point(self.kind, gap) for gap in sorted(self._measured)]
+
+    @property
+    def outcome(self) -> Outcome:
+        """Their outcomes [P, N]."""
+        measured = [self._measured[gap] for gap in sorted(self._measured)]
+        return Outcome(*(np.stack(values) for values in zip(*measured, strict=True)))
+
+    def add(self, point: Point, score: Floats, cost: Floats) -> None:
+        """Take the outcome of a wanted point, [N] each."""
+        self._measured[point.gap] = (score, cost)
+
+    def wanted(self) -> Point | None:
+        """The next point to measure with many devices; ``None`` when the search is over."""
+        gap = self._next()
+        return None if gap is None else Point(self.kind, gap)
+
+    def result(self) -> Tolerance:
+        """The crossing and its interval from the points with many devices."""
+        crossing = float(self._cross(self._reference.relative_score(self.outcome)))
+        low, high = self._interval()
+        return Tolerance(
+            self._bounded(crossing), (self._bounded(low), self._bounded(high)), crossing == math.inf
+        )
+
+    def _next(self) -> float | None:
+        scores = self._best_known()
+        gaps = sorted(scores)
+        left, right = _bracket(gaps, [scores[gap] for gap in gaps], self._level)
+        if left is not None and right is not None and right / left - 1 > self._bracket:
+            return self._middle(left, right)
+        for end in (left, right):
+            if end is not None and end not in self._measured:
+                return end
+        return self._next_for_interval(gaps)
+
+    def _next_for_interval(self, gaps: Sequence[float]) -> float | None:
+        """Widen the measured range until the interval lies inside it."""
+        first, last = min(self._measured), max(self._measured)
+        low, high = self._interval()
+        if low == -math.inf and first > gaps[0]:
+            return self._towards(first, gaps[gaps.index(first) - 1])
+        if high == math.inf and last < gaps[-1]:
+            return self._towards(last, gaps[gaps.index(last) + 1])
+        return None
+
+    def _towards(self, edge: float, neighbour: float) -> float:
+        near = max(edge, neighbour) / min(edge, neighbour) - 1 <= self._bracket
+        return neighbour if near else self._middle(edge, neighbour)
+
+    def _best_known(self) -> dict[float, float]:
+        """Scores by gap: with many devices where measured, else the grid's."""
+        if not self._measured:
+            return dict(self._grid)
+        scores = self._reference.relative_score(self.outcome)
+        return self._grid | dict(zip(sorted(self._measured), scores.tolist(), strict=True))
+
+    def _interval(self) -> tuple[float, float]:
+        replicates = self._cross(self._reference.score_replicates(self.outcome))
+        low, high = metrics.interval(replicates)
+        return float(low), float(high)
+
+    def _cross(self, scores: Floats) -> Floats:
+        gaps = np.array(sorted(self._measured))
+        return metrics.first_crossing(gaps, scores, self._level, log=self._log)
+
+    def _middle(self, left: float, right: float) -> float:
+        return math.sqrt(left * right) if self._log else (left + right) / 2
+
+    def _bounded(self, gap: float) -> float:
+        """Below at the first point: 0; never below: the end of the grid."""
+        return {-math.inf: 0.0, math.inf: max(self._grid)}.get(gap, gap)
+
+    @property
+    def _log(self) -> bool:
+        return self.kind == "delivery"
+
+
+def _bracket(
+    gaps: Sequence[float], scores: Sequence[float], level: float
+) -> tuple[float | None, float | None]:
+    """The neighbouring gaps around the first fall below ``level``; ``None`` beyond the grid."""
+    for index, score in enumerate(scores):
+        if score < level:
+            return (gaps[index - 1] if index else None), gaps[index]
+    return gaps[-1], None
+
+
+@dataclasses.dataclass(frozen=True)
+class Curves:
+    """One method under one protocol.
+
+    Attributes:
+        grid: outcomes on the grid by kind, few devices.
+        searches: finished searches by kind, many devices.
+    """
+
+    grid: dict[str, tuple[list[Point], Outcome]]
+    searches: dict[str, Search]
+
+
+def measure_curves(
+    measure: Measure, every_step: Outcome, reference: Reference, protocol: ProtocolSettings
+) -> Curves:
+    """Measure both curves of one method and search both tolerances, always in one batch.
+
+    Args:
+        measure: simulates points of the method.
+        every_step: the method with a packet at every step (g = 1), [1, curve devices]: the first
+            point of both curves, the same for all methods with one sensor and one actor.
+        reference: the teacher with all bracket devices.
+        protocol: grid, devices, level and bracket.
+    """
+    kinds = ("gap", "delivery")
+    gaps = [float(gap) for gap in protocol.gaps]
+    later = [Point(kind, gap) for kind in kinds for gap in gaps[1:]]
+    outcome = measure(later, protocol.curve_devices) if later else None
+    grid, searches = {}, {}
+    for number, kind in enumerate(kinds):
+        rows = slice(number * (len(gaps) - 1), (number + 1) * (len(gaps) - 1))
+        joined = every_step
+        if outcome is not None:
+            joined = Outcome(
+                np.concatenate([every_step.score, outcome.score[rows]]),
+                np.concatenate([every_step.cost, outcome.cost[rows]]),
+            )
+        grid[kind] = ([Point(kind, gap) for gap in gaps], joined)
+        scores = reference.relative_score(joined)
+        searches[kind] = Search(kind, gaps, scores, reference, protocol)
+    while wanted := [point for search in searches.values() if (point := search.wanted())]:
+        outcome = measure(wanted, protocol.bracket_devices)
+        for row, point in enumerate(wanted):
+            searches[point.kind].add(point, outcome.score[row], outcome.cost[row])
+    return Curves(grid, searches)

@@ -1,0 +1,159 @@
+"""Figures for papers: one column wide (3.5 in), readable in black and white, identical on every run.
+
+This is the only module that imports matplotlib (extra ``plot``). Figures are built without pyplot,
+so no display, backend or global state is involved.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from hjepa_cli.errors import UsageError
+from hjepa_cli.storage.files import write_bytes
+
+WIDTH_IN = 3.5  # an IEEE column
+DPI = 300
+RC = {
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "axes.titlesize": 7,
+    "legend.fontsize": 7,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "axes.linewidth": 0.6,
+    "grid.linewidth": 0.4,
+    "grid.alpha": 0.5,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 4,
+    "pdf.fonttype": 42,  # TrueType: IEEE refuses Type 3
+    "ps.fonttype": 42,
+    "svg.hashsalt": "hjepa",  # element ids depend on the content only
+}
+# Dates would make two runs differ.
+METADATA: dict[str, dict[str, Any]] = {
+    "png": {},
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None},
+}
+
+
+@dataclass(frozen=True)
+class Style:
+    """How one method is drawn everywhere. Hollow markers: controllers that see the true state."""
+
+    colour: str  # Okabe and Ito's palette, safe for colour-blind readers
+    marker: str
+    line: Any = "-"
+    hollow: bool = False
+
+
+STYLES = {
+    "hjepa": Style("#0072B2", "o"),
+    "ts-jepa-1": Style("#D55E00", "s", "--"),
+    "ts-jepa-4": Style("#009E73", "^", "-."),
+    "hold": Style("#CC79A7", "v", ":"),
+    "zero": Style("#E69F00", "D", (0, (3, 1, 1, 1, 1, 1))),
+    "oracle": Style("#000000", "o", "-", hollow=True),
+    "hold-true": Style("#7F7F7F", "v", ":", hollow=True),
+    "zero-true": Style("#7F7F7F", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
+}
+OTHERS = [Style("#56B4E9", marker, "--") for marker in "PX<>phd*"]
+
+
+def devices_figure(
+    rows: Sequence[Mapping[str, Any]], *, title: str = "", snr_label: str = "Target SNR (dB)"
+) -> Figure:
+    """Draw supported devices against the SNR, one line per method, as the paper's Fig. 4.
+
+    Args:
+        rows: of ``scale --json``: ``snr_db``, ``method``, ``devices``, ``devices_ci95``. Methods
+            that support nobody anywhere are named in the legend only.
+        title: one line above the axes.
+        snr_label: what the SNR is under the law.
+    """
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
+        axes = figure.add_subplot()
+        curves = _curves(rows)
+        for method, points in sorted(curves.items(), key=lambda item: -item[1][-1, 1]):
+            _draw(axes, method, points, _style(method, list(curves)))
+        counts = np.concatenate(list(curves.values()))[:, 1] if curves else np.zeros(1)
+        _scale_counts(axes, counts[counts > 0])
+        axes.set_xlabel(snr_label)
+        axes.set_ylabel("Supported devices")
+        axes.set_title(title)
+        axes.set_xticks(_snr_ticks(curves))
+        axes.grid(visible=True)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=2.4)
+        return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as .png, .svg or .pdf, atomically; equal figures give equal bytes."""
+    kind = path.suffix.removeprefix(".")
+    if kind not in METADATA:
+        raise UsageError(f"no figure format '{path.suffix}'; choose one of .png, .svg, .pdf")
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(RC):
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata=METADATA[kind])
+    write_bytes(path, buffer.getvalue())
+    return path
+
+
+def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Rows by method as arrays [points, (snr, devices, low, high)], ascending in SNR."""
+    curves: dict[str, list[list[float]]] = {}
+    for row in rows:
+        if row["devices"] is not None:
+            low, high = row["devices_ci95"] or (row["devices"], row["devices"])
+            point = [row["snr_db"], row["devices"], low, row["devices"] if high is None else high]
+            curves.setdefault(row["method"], []).append(point)
+    return {method: np.array(sorted(points), float) for method, points in curves.items()}
+
+
+def _style(method: str, methods: list[str]) -> Style:
+    others = [name for name in methods if name not in STYLES]
+    return STYLES.get(method) or OTHERS[others.index(method) % len(OTHERS)]
+
+
+def _draw(axes: Axes, method: str, points: np.ndarray, style: Style) -> None:
+    snr_db, devices, low, high = points.T
+    label = method if devices.any() else f"{method} (0)"
+    axes.plot(
+        snr_db,
+        np.where(devices > 0, devices, np.nan),
+        color=style.colour,
+        linestyle=style.line,
+        marker=style.marker,
+        markerfacecolor="white" if style.hollow else style.colour,
+        label=label,
+    )
+    if len(points) > 1:
+        axes.fill_between(snr_db, low, high, color=style.colour, alpha=0.18, linewidth=0)
+    else:
+        axes.vlines(snr_db, low, high, color=style.colour)
+
+
+def _scale_counts(axes: Axes, counts: np.ndarray) -> None:
+    """Logarithmic where the methods lie more than a decade apart, else from zero."""
+    if counts.size and counts.max() > 10 * counts.min():
+        axes.set_yscale("log", nonpositive="clip")
+        axes.set_ylim(0.7 * counts.min(), 1.5 * counts.max())
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.grid(visible=True, which="minor", axis="y", alpha=0.2)
+    else:
+        axes.set_ylim(0, 1.1 * counts.max(initial=1.0))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+
+
+def _snr_ticks(curves: Mapping[str, np.ndarray]) -> list[float]:
+    values = sorted({snr_db for points in curves.values() for snr_db in points[:, 0]})
+    return values[:: max(1, -(-len(values) // 8))]
