@@ -19,7 +19,7 @@ from typer.main import get_command
 
 from hjepa_cli import __version__, options, plan
 from hjepa_cli.checks import check_settings
-from hjepa_cli.errors import HjepaError, StorageError, UsageError
+from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
 from hjepa_cli.screen import Screen, one_line
 from hjepa_cli.settings import Settings, load_settings
 
@@ -87,10 +87,11 @@ def _expected(error: Exception, argv: list[str]) -> HjepaError:
     command = next((word for word in argv if word in (*STAGES, "models")), None)
     usage = f"hjepa {command} --help" if command else f"commands: {', '.join(STAGES)}, models"
     if isinstance(error, HjepaError):
-        if isinstance(error, UsageError):
-            error.hint = error.hint or usage
+        if error.hint is None:
+            again = "restore the file or make it again; what this command reads: "
+            error.hint = again + usage if isinstance(error, DataError) else usage
         return error
-    if isinstance(error, typer.TyperException):
+    if hasattr(error, "format_message"):  # Typer's usage errors; it has no public base class
         return UsageError(" ".join(error.format_message().split()), hint=usage)
     if isinstance(error, OSError):
         where = f": {error.filename}" if error.filename else ""
@@ -105,8 +106,20 @@ def _expected(error: Exception, argv: list[str]) -> HjepaError:
 
 
 def _settings(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -> Settings:
-    """Merge preset, file and flags; refuse values that make no sense before anything is touched."""
+    """Merge preset, file and flags; refuse values that make no sense before anything is touched.
+
+    A plant has its own ranges and noise, so ``--plant gym`` alone means its preset.
+    """
+    plant = flags["plant"]
+    if preset is None and plant == "gym":
+        preset = "gym"
     settings = load_settings(preset, config, flags)
+    if plant is not None and (preset == "gym") != (plant == "gym"):
+        raise UsageError(
+            f"preset '{settings.preset}' holds the ranges and noise of the other plant, "
+            f"not of '{plant}'",
+            hint="--preset gym for plant gym, and --config FILE.toml for other values of it",
+        )
     check_settings(settings)
     return settings
 
@@ -114,13 +127,13 @@ def _settings(preset: str | None, config: Path | None, flags: Mapping[str, Any])
 def _execute(
     screen: Screen,
     stage: Callable[[], Result],
-    planned: Callable[[], plan.Plan],
+    planned: Callable[[], plan.Plan] | None = None,
     *,
-    dry_run: bool,
+    dry_run: bool = False,
 ) -> None:
     """Run a stage, or show its plan, and print what it returns."""
     with _guard():
-        if dry_run:
+        if dry_run and planned is not None:
             planned().show(screen)
             return
         result = stage()
@@ -211,9 +224,9 @@ def collect(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
-        from hjepa_cli.stages import collect as module
+        from hjepa_cli.stages.collect import run
 
-        return module.run(settings, screen, out=out)
+        return run(settings, screen, out=out)
 
     _execute(screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run)
 
@@ -251,9 +264,9 @@ def train_encoder(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
-        from hjepa_cli.stages import train_encoder as module
+        from hjepa_cli.stages.train_encoder import run
 
-        return module.run(settings, screen, dataset=dataset, out=out)
+        return run(settings, screen, dataset=dataset, out=out)
 
     _execute(
         screen, stage, lambda: plan.plan_train_encoder(settings, dataset, out), dry_run=dry_run
@@ -294,9 +307,9 @@ def train_hierarchy(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
-        from hjepa_cli.stages import train_hierarchy as module
+        from hjepa_cli.stages.train_hierarchy import run
 
-        return module.run(settings, screen, dataset=dataset, encoder=encoder, out=out)
+        return run(settings, screen, dataset=dataset, encoder=encoder, out=out)
 
     _execute(
         screen,
@@ -341,9 +354,9 @@ def evaluate(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
-        from hjepa_cli.stages import evaluate as module
+        from hjepa_cli.stages.evaluate import run
 
-        return module.run(
+        return run(
             settings, screen, checkpoint=checkpoint, dataset=dataset, out=out, remeasure=remeasure
         )
 
@@ -403,9 +416,9 @@ def scale(
         snr_db = parse_snr(settings.radio.snr_db)
 
     def stage() -> Result:
-        from hjepa_cli.stages import scale as module
+        from hjepa_cli.stages.scale import run
 
-        return module.run(
+        return run(
             settings,
             screen,
             checkpoint=checkpoint,
@@ -423,3 +436,59 @@ def scale(
         ),
         dry_run=dry_run,
     )
+
+
+@models_app.callback(invoke_without_command=True)
+def models(context: typer.Context) -> None:
+    _print_help(context)
+
+
+@models_app.command("list")
+def list_models(
+    as_json: options.Json = False, quiet: options.Quiet = False, debug: options.Debug = False
+) -> None:
+    """List the models of the zoo."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.models import show_list
+
+        return show_list(screen)
+
+    _execute(screen, stage)
+
+
+@models_app.command()
+def info(
+    name: options.ModelName,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Describe one model: architecture, training, health, sha256."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.models import show_info
+
+        return show_info(screen, name)
+
+    _execute(screen, stage)
+
+
+@models_app.command()
+def verify(
+    names: options.ModelNames = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Check models against their sha256; without a name, all of the zoo."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.models import verify
+
+        return verify(screen, names or [])
+
+    _execute(screen, stage)

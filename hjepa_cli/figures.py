@@ -32,7 +32,6 @@ RC = {
     "grid.linewidth": 0.4,
     "grid.alpha": 0.5,
     "lines.linewidth": 1.1,
-    "lines.markersize": 4,
     "pdf.fonttype": 42,  # TrueType: IEEE refuses Type 3
     "ps.fonttype": 42,
     "svg.hashsalt": "hjepa",  # element ids depend on the content only
@@ -133,7 +132,8 @@ def _draw(axes: Axes, method: str, points: np.ndarray, style: Style) -> None:
         color=style.colour,
         linestyle=style.line,
         marker=style.marker,
-        markerfacecolor="white" if style.hollow else style.colour,
+        markerfacecolor="none" if style.hollow else style.colour,
+        markersize=6.5 if style.hollow else 4,  # a ring stays visible around a filled marker
         label=label,
     )
     if len(points) > 1:

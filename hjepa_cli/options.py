@@ -114,6 +114,14 @@ Checkpoint = Annotated[
     ),
 ]
 
+ModelName = Annotated[
+    str, typer.Argument(help="A zoo name or a path.", metavar="NAME|PATH", show_default=False)
+]
+ModelNames = Annotated[
+    list[str] | None,
+    typer.Argument(help="Zoo names or paths.", metavar="[NAME|PATH]...", show_default=False),
+]
+
 # --- data
 
 TrajectoryCount = Annotated[int | None, _count(DATA, "--trajectories", "Training trajectories.")]

@@ -37,15 +37,19 @@ class Method:
         name: as on the command line.
         sensor: what a device sends.
         controller: builds a fresh controller for n devices.
-        bits_per_transmission: what a transmission costs; ``None`` where nothing is transmitted.
+        reactive: builds one that only acts on packets, for links that deliver at every step.
+        bits_per_transmission: what a transmission costs.
         family: methods of one family play the same when a packet arrives at every step.
+        uses_link: ``False`` for ``optimal``, which sees every state whatever the link does.
     """
 
     name: str
     sensor: Sensor
     controller: Callable[[int], Controller]
-    bits_per_transmission: int | None
+    reactive: Callable[[int], Controller]
+    bits_per_transmission: int
     family: str
+    uses_link: bool = True
 
 
 def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Method:
@@ -54,18 +58,19 @@ def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Met
     Args:
         name: the method.
         kind: the nominal plant: its teacher and, for the oracle, its equations.
-        bits_per_transmission: counted as if embeddings were sent, so that device counts differ
-            by control alone. ``optimal`` does not use the link.
+        bits_per_transmission: counted as if embeddings were sent, so that device counts differ by
+            control alone.
     """
     act = teacher(kind)
-    build: Callable[[int], Controller]
+    reactive = functools.partial(LastForce, act, keep=True)
+    build: Callable[[int], Controller] = reactive
     if name == "oracle":
         advance = functools.partial(_advance, kind)
         build = functools.partial(Oracle, act, advance, kind.force_limit_n)
-    else:
-        build = functools.partial(LastForce, act, keep=name != "zero-true")
-    bits = None if name == "optimal" else bits_per_transmission
-    return Method(name, true_state, build, bits, "state")
+    elif name == "zero-true":
+        build = functools.partial(LastForce, act, keep=False)
+    uses_link = name != "optimal"
+    return Method(name, true_state, build, reactive, bits_per_transmission, "state", uses_link)
 
 
 def embedding_method(name: str, model: "Model", bits_per_value: int) -> Method:
@@ -74,13 +79,15 @@ def embedding_method(name: str, model: "Model", bits_per_value: int) -> Method:
     Raises:
         UsageError: the model does not hold this method.
     """
-    build: Callable[[int], Controller]
-    if name in ("hold", "zero"):
-        build = functools.partial(LastForce, model.actor, keep=name == "hold")
-    else:
+    reactive = functools.partial(LastForce, model.actor, keep=True)
+    build: Callable[[int], Controller] = reactive
+    if name == "zero":
+        build = functools.partial(LastForce, model.actor, keep=False)
+    elif name != "hold":
         build = functools.partial(StrideController, model.planner(name))
     bits = payload_bits(model.architecture["embedding"], bits_per_value)
-    return Method(name, embedding_sensor(model, bits_per_value), build, bits, "embedding")
+    sensor = embedding_sensor(model, bits_per_value)
+    return Method(name, sensor, build, reactive, bits, "embedding")
 
 
 def true_state(previous: Floats, states: Floats) -> Floats:

@@ -20,6 +20,7 @@ from hjepa_cli.settings import ProtocolSettings
 
 Floats = NDArray[np.float64]
 
+KINDS = ("gap", "delivery")
 
 @dataclasses.dataclass(frozen=True)
 class Point:
@@ -47,7 +48,7 @@ Measure = Callable[[Sequence[Point], int], Outcome]
 """Simulates points with the first ``devices`` draws: outcome arrays [P, devices]."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Reference:
     """The teacher, acting on the true state at every step, on the same draws.
 
@@ -254,12 +255,11 @@ def measure_curves(
         reference: the teacher with all bracket devices.
         protocol: grid, devices, level and bracket.
     """
-    kinds = ("gap", "delivery")
     gaps = [float(gap) for gap in protocol.gaps]
-    later = [Point(kind, gap) for kind in kinds for gap in gaps[1:]]
+    later = [Point(kind, gap) for kind in KINDS for gap in gaps[1:]]
     outcome = measure(later, protocol.curve_devices) if later else None
     grid, searches = {}, {}
-    for number, kind in enumerate(kinds):
+    for number, kind in enumerate(KINDS):
         rows = slice(number * (len(gaps) - 1), (number + 1) * (len(gaps) - 1))
         joined = every_step
         if outcome is not None:

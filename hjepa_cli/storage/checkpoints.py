@@ -14,7 +14,13 @@ import numpy as np
 
 from hjepa_cli.errors import DataError, MissingInputError, NumericalError
 from hjepa_cli.storage import tensors as arrays
-from hjepa_cli.storage.files import canonical_json, parse_json, read_bytes, write_bytes
+from hjepa_cli.storage.files import (
+    canonical_json,
+    check_schema,
+    parse_json,
+    read_bytes,
+    write_bytes,
+)
 
 SCHEMA = 1
 MODEL_FILE = "model.safetensors"  # the checkpoint's name in run directories and in the zoo
@@ -43,6 +49,7 @@ def save_checkpoint(
 
     Raises:
         NumericalError: a tensor or the metadata holds NaN or an infinity.
+        ValueError: another dtype, or a reserved key.
         StorageError: the disk refused; an older file at ``path`` is untouched.
     """
     if name := arrays.non_finite(tensors):
@@ -51,9 +58,10 @@ def save_checkpoint(
         raise ValueError(f"metadata may not use the reserved keys {sorted(reserved)}")
     sealed = {**metadata, "schema": SCHEMA, "sha256": ""}
     try:
-        digest = arrays.content_digest(sealed, tensors)
+        canonical_json(sealed)
     except ValueError as error:
-        raise NumericalError(f"refusing to write {path}: {error}") from None
+        raise NumericalError(f"refusing to write {path}: metadata: {error}") from None
+    digest = arrays.content_digest(sealed, tensors)
     write_bytes(path, arrays.pack(tensors, canonical_json({**sealed, "sha256": digest})))
     return digest
 
@@ -73,14 +81,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         ) from None
     tensors, text = arrays.unpack(data, path)
     sealed = _metadata(text, path)
-    schema = sealed.get("schema")
-    if type(schema) is int and schema > SCHEMA:
-        raise DataError(
-            f"checkpoint {path} has schema {schema}; this hjepa reads up to {SCHEMA}",
-            hint="pip install --upgrade hjepa",
-        )
-    if schema != SCHEMA:
-        raise DataError(f"checkpoint {path} has schema {schema!r}; expected {SCHEMA}")
+    check_schema(sealed.get("schema"), SCHEMA, f"checkpoint {path}")
     digest = arrays.content_digest({**sealed, "sha256": ""}, tensors)
     if sealed.get("sha256") != digest:
         raise DataError(

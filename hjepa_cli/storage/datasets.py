@@ -183,14 +183,7 @@ def load_dataset(path: Path, plant_name: str | None = None) -> Dataset:
     manifest = files.read_json(path / MANIFEST)
     if manifest.get("format") != FORMAT:
         raise DataError(f"{path} is not an hjepa dataset: its {MANIFEST} is of another program")
-    schema = manifest.get("schema")
-    if type(schema) is int and schema > SCHEMA:
-        raise DataError(
-            f"dataset {path} has schema {schema}; this hjepa reads up to {SCHEMA}",
-            hint="pip install --upgrade hjepa",
-        )
-    if schema != SCHEMA:
-        raise DataError(f"dataset {path} has schema {schema!r}; expected {SCHEMA}")
+    files.check_schema(manifest.get("schema"), SCHEMA, f"dataset {path}")
     digest = arrays.content_digest({**manifest, "sha256": ""}, {})
     if manifest.get("sha256") != digest:
         raise DataError(

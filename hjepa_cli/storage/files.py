@@ -91,6 +91,17 @@ def read_json(path: Path) -> dict[str, Any]:
         raise DataError(f"{path} is not valid JSON: {error}") from None
 
 
+def check_schema(found: object, newest: int, what: str) -> None:
+    """Demand the schema version this program writes. Raises DataError naming ``what``."""
+    if type(found) is int and found > newest:
+        raise DataError(
+            f"{what} has schema {found}; this hjepa reads up to {newest}",
+            hint="pip install --upgrade hjepa",
+        )
+    if type(found) is not int or found != newest:
+        raise DataError(f"{what} has schema {found!r}; expected {newest}")
+
+
 def read_bytes(path: Path, *, limit: int | None = None) -> bytes:
     """Read a whole file, refusing more than ``limit`` bytes.
 

@@ -1,0 +1,400 @@
+"""``hjepa eval``: prediction error, control score and tolerated losses of each method.
+
+A trained model (a run's or the zoo's) → closed-loop curves of every method, kept under a digest of
+all they depend on, and a table. ``scale`` takes the same curves through :func:`curves_for`.
+"""
+
+import dataclasses
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hjepa_cli.checks import check_methods
+from hjepa_cli.core.bench import Bench, control_entry, control_errors
+from hjepa_cli.core.loop import Floats
+from hjepa_cli.core.methods import TRUE_STATE, Method, embedding_method, true_state_method
+from hjepa_cli.core.metrics import WINDOWS
+from hjepa_cli.core.model import Model
+from hjepa_cli.core.payload import payload_bits
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.protocol import Point
+from hjepa_cli.core.trajectories import generate
+from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.screen import Advance, Screen
+from hjepa_cli.settings import Settings
+from hjepa_cli.storage import curves, runs, zoo
+from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
+from hjepa_cli.storage.curves import CURVES_FILE, Digest, Entry
+from hjepa_cli.storage.datasets import Dataset, load_dataset
+from hjepa_cli.storage.runs import Run
+
+MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods (spec §4)
+USUAL_SIMULATIONS = 8  # of one method, for its progress bar: the grid, then the bisection
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What is evaluated: a model, if there is one, and the rollouts its NMAE is taken on.
+
+    Attributes:
+        settings: plant, seed, protocol.
+        model: ``None`` when only true-state methods can be measured.
+        path: the model's file.
+        dataset: whose clean rollouts to use; ``None`` makes them again from the settings.
+    """
+
+    settings: Settings
+    model: Model | None
+    path: Path | None
+    dataset: Dataset | None
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods that can be measured."""
+        return (*(self.model.methods if self.model else ()), *TRUE_STATE)
+
+    @property
+    def digest(self) -> Digest:
+        """What curves must have been measured with to be this subject's."""
+        return Digest.of(
+            self.model.digest if self.model else None,
+            self.settings,
+            self.dataset.digest if self.dataset else None,
+        )
+
+    @property
+    def beside(self) -> list[Path]:
+        """Where the model's own curves are; the zoo's are never written, a run's are."""
+        return [self.path.with_name(CURVES_FILE)] if self.path else []
+
+    def skipped(self, methods: Sequence[str]) -> dict[str, str]:
+        """The methods without a model, with what would train it."""
+        return {name: _how_to_train(name, self) for name in methods if name not in self.methods}
+
+
+def run(
+    settings: Settings,
+    screen: Screen,
+    *,
+    checkpoint: str | None = None,
+    dataset: Path | None = None,
+    out: Path | None = None,
+    remeasure: bool = False,
+) -> dict[str, Any]:
+    """Evaluate ``settings.methods``; returns the document of spec §8.
+
+    Args:
+        settings: what to measure.
+        screen: where to say so.
+        checkpoint: zoo name, run directory or file; default: the newest run of the plant, else
+            the zoo.
+        dataset: take the clean rollouts for the NMAE from here instead of making them again.
+        out: run directory; an interrupted one is continued after the last finished method.
+        remeasure: do not use cached curves.
+
+    Raises:
+        UsageError: unknown method.
+        MissingInputError: no such checkpoint or dataset.
+        DataError: a damaged file, or one of another plant.
+    """
+    check_methods(settings.methods)
+    subject = open_subject(settings, screen, checkpoint, dataset)
+    with Run.create("eval", out, settings.as_dict()) as record:
+        if record.result is None:
+            record.finish(_evaluate(subject, screen, record, settings.methods, remeasure))
+        else:
+            screen.say(f"{record.directory} is finished; this is its result")
+        assert record.result is not None
+        show(record.result, screen)
+        return record.result
+
+
+def curves_for(
+    settings: Settings,
+    screen: Screen,
+    *,
+    methods: Sequence[str],
+    checkpoint: str | None = None,
+    dataset: Path | None = None,
+    remeasure: bool = False,
+) -> tuple[str, dict[str, Entry], str]:
+    """Curves for ``scale``: cached where they fit, else measured and kept in a new eval run.
+
+    Returns:
+        The model's path, the entries by method (methods without a model are left out, and said),
+        and where the entries come from, as a text.
+
+    Raises:
+        As :func:`run`.
+    """
+    check_methods(tuple(methods))
+    subject = open_subject(settings, screen, checkpoint, dataset)
+    name = str(subject.path or "no model")
+    found = {} if remeasure else _cached(subject, methods)
+    missing = [name for name in methods if name in subject.methods and name not in found]
+    if not missing:
+        _say_skipped(subject, screen, methods)
+        entries = {name: found[name][0] for name in methods if name in found}
+        return name, entries, _source(found)
+    with Run.create("eval", None, settings.as_dict()) as record:
+        result = record.finish(_evaluate(subject, screen, record, methods, remeasure))
+    return name, result["methods"], result["source"]
+
+
+def measure_points(
+    settings: Settings,
+    screen: Screen,
+    *,
+    method: str,
+    gaps: Sequence[float] = (),
+    probabilities: Sequence[float] = (),
+    checkpoint: str | None = None,
+) -> list[dict[str, Any]]:
+    """Drive all bracket devices at given gaps (steps) or delivery probabilities, now.
+
+    Returns:
+        One entry per gap, then per probability: ``d`` or ``p``, ``score``, ``ci95``, ``lq_ratio``,
+        ``n_devices``, as in the curves of :func:`run`.
+
+    Raises:
+        UsageError: the method cannot be measured.
+        As :func:`run` for the checkpoint.
+    """
+    subject = open_subject(settings, screen, checkpoint, None)
+    if method not in subject.methods:
+        raise UsageError(
+            f"no model for method '{method}'; choose from {', '.join(subject.methods)}",
+            hint=_how_to_train(method, subject),
+        )
+    points = [Point("gap", gap) for gap in gaps]
+    points += [Point("delivery", 1 / p) for p in probabilities]
+    with _ticking(screen, f"verify {method}", 2 * settings.protocol.steps) as bar:
+        bench = Bench(plant(settings.plant), settings.protocol, settings.seed, bar.advance)
+        devices = settings.protocol.bracket_devices
+        outcome = bench.measure(_method(method, subject), points, devices)
+    return bench.reference.describe(points, outcome)
+
+
+def open_subject(
+    settings: Settings, screen: Screen, checkpoint: str | None, dataset: Path | None
+) -> Subject:
+    """Load what is to be evaluated, and say which model it is where the user did not."""
+    path = zoo.resolve_model(checkpoint) if checkpoint else _default_model(settings, screen)
+    model = Model.load(path, settings.device) if path else None
+    if model and model.plant_name != settings.plant:
+        raise DataError(
+            f"model {path} drives plant {model.plant_name}, not {settings.plant}",
+            hint=f"add --plant {model.plant_name} or --preset {model.plant_name}, "
+            "or pass another --checkpoint",
+        )
+    data = load_dataset(dataset, settings.plant) if dataset else None
+    return Subject(settings, model, path, data)
+
+
+def show(result: dict[str, Any], screen: Screen) -> None:
+    """Print the table of an evaluation, and what it left out."""
+    for name, how in result["skipped"].items():
+        screen.say(f"{name} skipped: {how}")
+    entries = result["methods"]
+    if not entries:
+        return
+    windows = [f"{first}-{last}" for first, last in WINDOWS]
+    rows = [
+        [
+            name,
+            *(_number(entry["nmae_windows"].get(window), 3) for window in windows),
+            _number(entry["score"], 3),
+            _number(entry["lq_ratio"], 3),
+            entry["bits_per_transmission"],
+            _tolerance(entry, "gap_steps", "gap", 1, ">"),
+            _tolerance(entry, "p", "p", 4, "<"),
+        ]
+        for name, entry in entries.items()
+    ]
+    first = next(iter(entries.values()))
+    screen.table(
+        f"{result['plant']}, seed {result['seed']}: NMAE by steps since the packet "
+        f"({first['n_rollouts']} rollouts), score and LQ ratio with every packet "
+        f"({first['n_curve_devices']} devices), tolerances at the acceptable score "
+        f"({first['n_devices']} devices, 95 % CI)",
+        [
+            "method",
+            *(f"NMAE {window}" for window in windows),
+            "score",
+            "LQ",
+            "bits",
+            "gap D* [steps]",
+            "delivery p*",
+        ],
+        rows,
+    )
+    screen.say(result["source"])
+
+
+def _evaluate(
+    subject: Subject, screen: Screen, record: Run, methods: Sequence[str], remeasure: bool
+) -> dict[str, Any]:
+    """Take what is cached, measure the rest, keep each method as soon as it is done."""
+    settings = subject.settings
+    own = record.path(CURVES_FILE)
+    found = {} if remeasure else _cached(subject, methods)
+    found |= {name: (entry, own) for name, entry in curves.read(own, subject.digest).items()}
+    keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
+    missing = [name for name in methods if name in subject.methods and name not in found]
+    if missing:
+        clean = _clean_rollouts(subject)
+        with _ticking(screen, "eval teacher", settings.protocol.steps) as bar:
+            bench = Bench(plant(settings.plant), settings.protocol, settings.seed, bar.advance)
+        if bench.teacher_score < MIN_TEACHER_SCORE:
+            screen.say(
+                f"the teacher itself scores only {bench.teacher_score:.2f} here (a sound protocol "
+                f"gives it {MIN_TEACHER_SCORE}): normalised scores say little"
+            )
+    for name in missing:
+        with _ticking(screen, f"eval {name}", USUAL_SIMULATIONS * settings.protocol.steps) as bar:
+            bench.tick = bar.advance
+            entry = _measure(_method(name, subject), bench, clean, settings)
+        for path in keep:
+            curves.write(path, subject.digest, {name: entry})
+        record.event("measured", method=name)
+        found[name] = (entry, own)
+    curves.write(own, subject.digest, {name: entry for name, (entry, _) in found.items()})
+    return {
+        "checkpoint": subject.path,
+        "plant": settings.plant,
+        "seed": settings.seed,
+        "horizon": list(range(settings.protocol.horizon + 1)),
+        "methods": {name: found[name][0] for name in methods if name in found},
+        "skipped": subject.skipped(methods),
+        "curves": own,
+        "source": _source(found),
+    }
+
+
+def _measure(
+    method: Method, bench: Bench, clean: tuple[Floats, Floats], settings: Settings
+) -> Entry:
+    """One method's entry of ``eval --json`` (spec §8)."""
+    horizon, replicates = settings.protocol.horizon, settings.protocol.bootstrap
+    errors = control_errors(method, *clean, bench.plant.force_limit_n, horizon)
+    return {
+        **control_entry(errors, replicates, settings.seed),
+        **bench.entry(method),
+        "teacher_score": bench.teacher_score,
+        "seed": settings.seed,
+    }
+
+
+def _method(name: str, subject: Subject) -> Method:
+    settings = subject.settings
+    bits = settings.protocol.payload_bits_per_value
+    if name in TRUE_STATE:
+        sent = payload_bits(settings.encoder.embedding, bits)
+        return true_state_method(name, plant(settings.plant), sent)
+    assert subject.model is not None
+    return embedding_method(name, subject.model, bits)
+
+
+def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:
+    """States [R, steps + 1, 4] and teacher's forces [R, steps] without exploration or noise."""
+    settings = subject.settings
+    if subject.dataset:
+        rollouts = subject.dataset.split("clean")
+    else:
+        rollouts = generate(settings, "clean")
+    steps, horizon = rollouts.teacher_n.shape[1], settings.protocol.horizon
+    if steps <= horizon:
+        raise UsageError(
+            f"protocol.horizon = {horizon} needs clean rollouts of {horizon + 1} steps; "
+            f"they have {steps}"
+        )
+    return rollouts.states.astype("float64"), rollouts.teacher_n.astype("float64")
+
+
+def _default_model(settings: Settings, screen: Screen) -> Path | None:
+    """The newest finished run of the plant, else the zoo's first model of it."""
+
+    def fits(directory: Path) -> bool:
+        return bool(runs.read_config(directory).get("plant") == settings.plant)
+
+    directory = runs.newest_run("train-hierarchy", fits)
+    if directory:
+        screen.say(f"model of the newest run, {directory}")
+        return directory / MODEL_FILE
+    for name in zoo.list_models():
+        path = zoo.resolve_model(name)
+        if load_checkpoint(path).metadata["plant"] == settings.plant:
+            screen.say(f"no run of train-hierarchy here: model {name} of the zoo")
+            return path
+    screen.say(f"no model of plant {settings.plant}: true-state methods only")
+    return None
+
+
+def _cached(subject: Subject, methods: Sequence[str]) -> dict[str, tuple[Entry, Path]]:
+    wanted = [name for name in methods if name in subject.methods]
+    return curves.find(subject.digest, wanted, subject.beside)
+
+
+def _source(found: dict[str, tuple[Entry, Path]]) -> str:
+    paths = ", ".join(dict.fromkeys(str(path) for _, path in found.values()))
+    return f"curves of {paths or 'nothing'}; --remeasure measures them again"
+
+
+def _say_skipped(subject: Subject, screen: Screen, methods: Sequence[str]) -> None:
+    for name, how in subject.skipped(methods).items():
+        screen.say(f"{name} skipped: {how}")
+
+
+def _how_to_train(method: str, subject: Subject) -> str:
+    """The command that trains the model of a method."""
+    plant_flag = "" if subject.settings.preset == "default" else f" --preset {subject.settings.preset}"
+    train = f"hjepa train-hierarchy{plant_flag}"
+    if method.startswith("ts-jepa-") and subject.model is not None:
+        h = int(method.removeprefix("ts-jepa-"))
+        return f"{train} --h {h} --m {h // 2 if h % 2 == 0 else 1} --l 1"
+    if method in ("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero"):
+        return train
+    return "no command of this version trains it"
+
+
+def _is_run(directory: Path) -> bool:
+    """A run directory of ours that we may write to; the zoo has none."""
+    return (directory / runs.CONFIG).is_file() and os.access(directory, os.W_OK)
+
+
+@contextmanager
+def _ticking(screen: Screen, label: str, steps: int) -> Iterator[Advance]:
+    """A progress bar over control steps whose number is a guess: it neither overruns nor stops."""
+    with screen.progress(label, steps, "steps") as bar:
+        counter = _Counter(bar, steps)
+        yield counter
+        counter.advance(steps)
+
+
+class _Counter:
+    def __init__(self, bar: Advance, total: int) -> None:
+        self._bar, self._left = bar, total
+
+    def advance(self, count: int = 1, **fields: float) -> None:
+        count = min(count, self._left)
+        self._left -= count
+        self._bar.advance(count, **fields)
+
+
+def _number(value: float | None, decimals: int) -> str | None:
+    return None if value is None else f"{value:.{decimals}f}"
+
+
+def _tolerance(
+    entry: Entry, value_key: str, key: str, decimals: int, beyond: str
+) -> str | None:
+    """``112.5 [104.1, 118.0]``; ``> 320`` where the score is acceptable to the grid's end."""
+    value = entry[f"tolerance_{value_key}"]
+    if value is None:
+        return None
+    if entry[f"tolerance_{key}_censored"]:
+        return f"{beyond} {value:.{decimals}f}"
+    low, high = entry[f"tolerance_{key}_ci95"]
+    return f"{value:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]"

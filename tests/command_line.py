@@ -1,0 +1,81 @@
+"""Running the command line inside the test process, the way the shell would."""
+
+import contextlib
+import dataclasses
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hjepa_cli.cli import main
+
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "HJEPA_DEBUG": "0"}  # for child processes
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What the shell sees of one command."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def document(self) -> Any:
+        """The one JSON document on stdout."""
+        assert self.out.endswith("}\n") and self.out.count("\n") == 1
+        return json.loads(self.out, parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
+
+
+class Shell:
+    """Calls ``hjepa ARGUMENTS`` in an empty directory."""
+
+    def __init__(self, directory: Path, capture: pytest.CaptureFixture[str]) -> None:
+        self.directory = directory
+        self._capture = capture
+
+    def __call__(self, *arguments: str | Path) -> Outcome:
+        self._capture.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            main([str(argument) for argument in arguments])
+        captured = self._capture.readouterr()
+        return Outcome(int(stop.value.code or 0), captured.out, captured.err)
+
+    def files(self) -> dict[str, bytes | None]:
+        """Everything below the directory: contents of files, ``None`` for directories."""
+        return {
+            str(path.relative_to(self.directory)): path.read_bytes() if path.is_file() else None
+            for path in sorted(self.directory.rglob("*"))
+        }
+
+    @contextlib.contextmanager
+    def untouched(self) -> Iterator[None]:
+        """Assert that nothing below the directory is created, changed or removed."""
+        before = self.files()
+        yield
+        assert self.files() == before
+
+
+def open_shell(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, capture: pytest.CaptureFixture[str]
+) -> Shell:
+    """Return a command line in ``directory``, 80 columns wide."""
+    monkeypatch.chdir(directory)
+    monkeypatch.delenv("HJEPA_DEBUG", raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    return Shell(directory, capture)
+
+
+def assert_one_line_error(outcome: Outcome, code: int, *fragments: str) -> None:
+    """One line that says what was wrong, at most one that says what to do, and nothing else."""
+    assert outcome.code == code, outcome
+    lines = outcome.err.splitlines()
+    assert lines and lines[0].startswith("error: "), outcome
+    assert len(lines) == 2 and lines[1].startswith("hint: "), outcome
+    assert outcome.out == "" and "Traceback" not in outcome.err
+    for fragment in fragments:
+        assert fragment in outcome.err, f"{fragment!r} is not in {outcome.err!r}"

@@ -1,0 +1,118 @@
+"""The zoo: shipped models found by name, in a checkout and in an installed wheel."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.storage import zoo
+from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
+
+
+@pytest.fixture
+def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A zoo of two models, one with curves, beside things that are no models."""
+    root = tmp_path / "zoo"
+    monkeypatch.setattr(zoo, "zoo_directory", lambda: root)
+    for name in ("desktop-h4m2l1", "gym-h4m2l1", "Capital", "-dash", "n" * 65):
+        (root / name).mkdir(parents=True)
+        digest = save_checkpoint(
+            root / name / MODEL_FILE, {"w": np.zeros(3, np.float32)}, {"plant": name}
+        )
+    (root / "empty").mkdir()
+    (root / "README.md").write_text("")
+    write_curves(root / "gym-h4m2l1", digest_of(root / "gym-h4m2l1"))
+    assert digest
+    monkeypatch.chdir(tmp_path)
+    return root
+
+
+def digest_of(model: Path) -> str:
+    return zoo.load_checkpoint(model / MODEL_FILE).digest
+
+
+def write_curves(model: Path, digest: str) -> None:
+    text = json.dumps({"schema": 1, "digest": {"checkpoint": digest}, "methods": {}})
+    (model / zoo.CURVES_FILE).write_text(text)
+
+
+def test_only_valid_names_with_a_model_are_listed(models: Path) -> None:
+    assert zoo.list_models() == ["desktop-h4m2l1", "gym-h4m2l1"]
+
+
+def test_an_absent_zoo_is_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zoo, "zoo_directory", lambda: tmp_path / "gone")
+    assert zoo.list_models() == []
+    with pytest.raises(MissingInputError, match="no model 'x'"):
+        zoo.resolve_model("x")
+
+
+def test_names_files_and_run_directories_resolve(models: Path, tmp_path: Path) -> None:
+    expected = models / "desktop-h4m2l1" / MODEL_FILE
+    assert zoo.resolve_model("desktop-h4m2l1") == expected
+    assert zoo.resolve_model(str(expected)) == expected
+    assert zoo.resolve_model(expected.parent) == expected
+    os.symlink(expected, tmp_path / "mine.safetensors")
+    assert zoo.resolve_model("mine.safetensors") == Path("mine.safetensors")
+
+
+def test_a_zoo_name_wins_over_a_local_file(models: Path, tmp_path: Path) -> None:
+    (tmp_path / "gym-h4m2l1").write_text("not a model")
+    assert zoo.resolve_model("gym-h4m2l1") == models / "gym-h4m2l1" / MODEL_FILE
+    assert zoo.resolve_model("./gym-h4m2l1") == Path("gym-h4m2l1")
+
+
+def test_unknown_names_show_the_choices(models: Path) -> None:
+    with pytest.raises(MissingInputError, match="did you mean 'desktop-h4m2l1'") as caught:
+        zoo.resolve_model("desktop-h4m2")
+    assert caught.value.hint == "hjepa models list"
+    with pytest.raises(MissingInputError, match="the zoo has desktop-h4m2l1, gym-h4m2l1"):
+        zoo.resolve_model("zzz")
+
+
+@pytest.mark.parametrize("name", ["../zoo/gym-h4m2l1x", "..", "Capital", "", "gym-h4m2l1/../x"])
+def test_names_never_lead_out_of_the_zoo(models: Path, name: str) -> None:
+    """They are looked up among the listed names only; as paths they are the user's own."""
+    (models.parent / "work").mkdir()
+    os.chdir(models.parent / "work")
+    with pytest.raises(MissingInputError):
+        zoo.resolve_model(name)
+
+
+def test_a_directory_without_a_model_says_so(models: Path) -> None:
+    with pytest.raises(MissingInputError, match=f"holds no {MODEL_FILE}"):
+        zoo.resolve_model(models / "empty")
+
+
+def test_verify_reports_and_notices_damage(models: Path) -> None:
+    found = zoo.verify_model("gym-h4m2l1")
+    assert found.name == "gym-h4m2l1" and found.metadata == {"plant": "gym-h4m2l1"}
+    assert found.digest == digest_of(models / "gym-h4m2l1") and found.has_curves
+    assert found.size_bytes == os.path.getsize(models / "gym-h4m2l1" / MODEL_FILE)
+    assert not zoo.verify_model("desktop-h4m2l1").has_curves
+    data = bytearray((models / "gym-h4m2l1" / MODEL_FILE).read_bytes())
+    data[-1] ^= 1
+    (models / "gym-h4m2l1" / MODEL_FILE).write_bytes(data)
+    with pytest.raises(DataError, match="changed after it was written"):
+        zoo.verify_model("gym-h4m2l1")
+
+
+@pytest.mark.parametrize("curves", ['{"digest": {"checkpoint": "0"}}', '{"digest": 3}', "{}"])
+def test_curves_of_another_checkpoint_are_refused(models: Path, curves: str) -> None:
+    (models / "gym-h4m2l1" / zoo.CURVES_FILE).write_text(curves)
+    with pytest.raises(DataError, match="measured on another checkpoint"):
+        zoo.verify_model("gym-h4m2l1")
+
+
+def test_shipped_models_are_whole() -> None:
+    """Every folder of the real zoo has a valid name, a verified model, curves and a card."""
+    root = zoo.zoo_directory()
+    folders = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+    assert folders == zoo.list_models()
+    for name in folders:
+        assert zoo.verify_model(name).has_curves
+        card = (root / name / zoo.CARD_FILE).read_text(encoding="utf-8")
+        assert card.startswith("---\n"), "a card begins with YAML front matter"
