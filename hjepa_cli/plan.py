@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import MissingInputError
+from hjepa_cli.errors import HjepaError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 
@@ -23,6 +23,7 @@ RATES_PER_S = {  # two cores of a server CPU
     "level training steps": 20.0,
     "closed-loop frames": 2_000.0,
 }
+STATE_METHODS = ("hold-true", "zero-true", "optimal", "oracle")  # these render and encode nothing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +121,7 @@ def plan_train_hierarchy(
     parameters = ENCODER_PARAMETERS + 4 * _predictor(settings, options.h)
     return Plan(
         command="train-hierarchy",
-        reads=[_dataset(dataset, settings), _encoder(encoder)],
+        reads=[_dataset(dataset, settings), _encoder(encoder, settings)],
         work=[
             f"render and encode about {frames} frames and their mirror images",
             f"train P^H, P^M, P^L (h, m, l = {options.h}, {options.m}, {options.l}), "
@@ -150,7 +151,7 @@ def plan_eval(
     """Plan of ``hjepa eval``."""
     return Plan(
         command="eval",
-        reads=[_model(checkpoint), _clean(dataset, settings)],
+        reads=[_model(checkpoint, settings), _clean(dataset, settings)],
         work=[_loop_line(settings) + ("" if remeasure else ", unless its curves are cached")],
         writes=[f"run {_run('eval', out)}"],
         writes_bytes=200_000,
@@ -180,7 +181,7 @@ def plan_scale(
         work.append("simulate one block at 0.9 and 1.1 of each tolerance")
     return Plan(
         command="scale",
-        reads=[_model(checkpoint)],
+        reads=[_model(checkpoint, settings)],
         work=work,
         writes=[f"run {_run('scale', out)} with the table (CSV) and the figure (PNG, SVG)"],
         writes_bytes=300_000,
@@ -240,9 +241,6 @@ def _loop_seconds(settings: Settings) -> float:
     return _seconds({"closed-loop frames": frames})
 
 
-STATE_METHODS = ("hold-true", "zero-true", "optimal", "oracle", "state-kf", "state-48", "local")
-
-
 def _dataset(path: Path | None, settings: Settings) -> str:
     from hjepa_cli.storage.datasets import find_newest_dataset, load_dataset
 
@@ -256,31 +254,35 @@ def _clean(path: Path | None, settings: Settings) -> str:
     return _dataset(path, settings) if path else "the clean rollouts of the newest dataset, if any"
 
 
-def _encoder(name: str | None) -> str:
-    from hjepa_cli.storage.runs import newest_run
+def _encoder(name: str | None, settings: Settings) -> str:
+    found = _named(name) or _newest_run("train-encoder", settings)
+    return f"encoder {found}" if found else "encoder: none yet (hjepa train-encoder)"
+
+
+def _model(name: str | None, settings: Settings) -> str:
+    found = _named(name) or _newest_run("train-hierarchy", settings)
+    return f"model {found}" if found else "model of the zoo"
+
+
+def _named(name: str | None) -> Path | None:
     from hjepa_cli.storage.zoo import resolve_model
 
-    if name is not None:
-        return f"encoder {resolve_model(name)}"
-    found = _look(lambda: newest_run("train-encoder"))
-    return f"encoder of run {found}" if found else "encoder: none yet (hjepa train-encoder)"
+    return None if name is None else resolve_model(name)
 
 
-def _model(name: str | None) -> str:
-    from hjepa_cli.storage.runs import newest_run
-    from hjepa_cli.storage.zoo import resolve_model
+def _newest_run(stage: str, settings: Settings) -> Path | None:
+    from hjepa_cli.storage.runs import newest_run, read_config
 
-    if name is not None:
-        return f"model {resolve_model(name)}"
-    found = _look(lambda: newest_run("train-hierarchy"))
-    return f"model of run {found}" if found else "model of the zoo"
+    return _look(
+        lambda: newest_run(stage, lambda run: read_config(run).get("plant") == settings.plant)
+    )
 
 
 def _look(find: Callable[[], Path | None]) -> Path | None:
-    """An input that is not there yet does not spoil a plan."""
+    """An input that is not there yet, or not readable, does not spoil a plan."""
     try:
         return find()
-    except MissingInputError:
+    except HjepaError:
         return None
 
 

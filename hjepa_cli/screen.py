@@ -94,8 +94,9 @@ class Screen:
                 repeats the first column.
         """
         cells = [[_cell(value) for value in row] for row in rows]
-        lines = layout(columns, cells, shutil.get_terminal_size((80, 24)).columns)
-        print("\n".join([one_line(title), *lines]), file=self._results, flush=True)
+        width = shutil.get_terminal_size((80, 24)).columns
+        lines = textwrap.wrap(one_line(title), width) + layout(columns, cells, width)
+        print("\n".join(lines), file=self._results, flush=True)
 
     @contextmanager
     def progress(self, label: str, total: int, unit: str, *, done: int = 0) -> Iterator[Advance]:
@@ -313,10 +314,10 @@ def _blocks(widths: Sequence[int], available: int) -> list[list[int]]:
 
 
 def _is_number(cell: str) -> bool:
-    """Set right-aligned: numbers, possibly with a unit or an interval after them, and blanks."""
-    first = cell.split(maxsplit=1)[:1]
+    """Set right-aligned: numbers, also bounds (>320) or with an interval after them, and blanks."""
+    first, *_ = cell.split() or [MISSING]
     try:
-        return not first or first[0] == MISSING or math.isfinite(float(first[0].replace(",", "")))
+        return first == MISSING or math.isfinite(float(first.lstrip("<>≤≥~").replace(",", "")))
     except ValueError:
         return False
 

@@ -92,7 +92,7 @@ class HierarchySettings:
 
     h: int
     m: int
-    l: int  # noqa: E741 - the paper's symbol
+    l: int
     rollout_steps: int
     batch_trajectories: int
     coarse_starts: int
@@ -218,7 +218,9 @@ def _override(values: dict[str, Any], changes: Mapping[str, Any], source: str) -
     for key, value in changes.items():
         if key not in values:
             near = difflib.get_close_matches(key, values, n=1)
-            suggestion = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(values)}"
+            suggestion = (
+                f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(values)}"
+            )
             raise UsageError(f"unknown setting '{key}' in {source}; {suggestion}")
         if isinstance(values[key], dict):
             if not isinstance(value, Mapping):

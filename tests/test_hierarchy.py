@@ -20,9 +20,7 @@ from hjepa_cli.core.levels import EmbeddedTrajectories
 from hjepa_cli.errors import UsageError
 
 NESTED = [
-    (h, m, l)
-    for h, m, l in itertools.product(range(1, 25), repeat=3)
-    if h % m == 0 and m % l == 0
+    (h, m, l) for h, m, l in itertools.product(range(1, 25), repeat=3) if h % m == 0 and m % l == 0
 ]
 
 
@@ -50,14 +48,12 @@ class Clock:
 def fake(trajectories: int, steps: int) -> EmbeddedTrajectories:
     k = torch.arange(steps, dtype=torch.float32)
     rows = torch.arange(trajectories, dtype=torch.float32)
-    z = torch.stack(
-        [rows[:, None].expand(-1, steps), k[None].expand(trajectories, -1)], dim=-1
-    )
+    z = torch.stack([rows[:, None].expand(-1, steps), k[None].expand(trajectories, -1)], dim=-1)
     return EmbeddedTrajectories(z, k[None].expand(trajectories, -1).contiguous())
 
 
 @pytest.mark.parametrize(("h", "m", "l"), NESTED)
-def test_plan_stride_is_aligned(h: int, m: int, l: int) -> None:  # noqa: E741
+def test_plan_stride_is_aligned(h: int, m: int, l: int) -> None:
     z = torch.stack([torch.arange(3.0), torch.tensor([0.0, 40.0, 7.0])], dim=1)
     coarse = Clock(h, exact_actions=False)
     actions, embeddings, z_next = plan_stride(
@@ -80,7 +76,9 @@ def test_plan_stride_is_aligned(h: int, m: int, l: int) -> None:  # noqa: E741
 def test_anchor_is_recomputed_with_the_played_actions() -> None:
     seen: list[Tensor] = []
 
-    def coarse(z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1) -> Tensor:
+    def coarse(
+        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+    ) -> Tensor:
         seen.append(actions)
         return z + torch.tensor([0.0, 4.0])
 
@@ -103,7 +101,7 @@ def test_anchor_is_recomputed_with_the_played_actions() -> None:
 
 
 @pytest.mark.parametrize(("h", "m", "l"), [s for s in NESTED if s[0] <= 12])
-def test_training_gaps_are_aligned(h: int, m: int, l: int, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: E741
+def test_training_gaps_are_aligned(h: int, m: int, l: int, monkeypatch: pytest.MonkeyPatch) -> None:
     data, generator = fake(6, 50), np.random.default_rng(0)
     compared: list[tuple[Tensor, Tensor]] = []
 
@@ -192,7 +190,7 @@ def test_frame_windows_pair_each_frame_with_its_predecessor_and_mirror_both() ->
     ("h", "m", "l", "valid"),
     [(4, 3, 1, "1, 2, 4"), (12, 6, 4, "1, 2, 3, 6"), (4, 8, 1, "1, 2, 4"), (4, 2, 0, "1, 2")],
 )
-def test_strides_that_do_not_nest_name_the_valid_ones(h: int, m: int, l: int, valid: str) -> None:  # noqa: E741
+def test_strides_that_do_not_nest_name_the_valid_ones(h: int, m: int, l: int, valid: str) -> None:
     with pytest.raises(UsageError, match=valid):
         Strides(h, m, l)
 

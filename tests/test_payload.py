@@ -32,8 +32,8 @@ def test_equals_the_definition(bits: int) -> None:
     step = np.abs(z.numpy()).max(axis=1, keepdims=True) / (2 ** (bits - 1) - 1)
     # Single precision may round a value that lies halfway between two codes the other way.
     off = np.abs(received - reference(z.numpy(), bits)) / step
-    assert (off < 1e-3).mean() > 0.999
-    assert off.max() < 1.001
+    assert (off < 5e-3).mean() > 0.999
+    assert off.max() < 1.01
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,17 @@ def test_numbers_align_right_and_texts_left():
     assert lines == ["name     n", "----------", "a        5", "bb    1234", "c        -"]
 
 
+def test_bounds_and_intervals_count_as_numbers():
+    lines = layout(["D*"], [[">320"], ["9.5 [8, 11]"], ["-"]], 80)
+    assert lines == ["         D*", "-----------", "       >320", "9.5 [8, 11]", "          -"]
+
+
+def test_a_long_title_wraps(streams, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    screen_on(streams).table("words " * 40, ["a"], [[1]])
+    assert max(map(len, streams[0].getvalue().splitlines())) <= 80
+
+
 def test_long_texts_fold_but_numbers_do_not():
     path = "/very/long/path/" * 5
     lines = layout(["path", "bytes"], [[path, "123456789"]], 40)

@@ -1,10 +1,12 @@
 """The context encoder Ψ: two camera frames in, one embedding out (paper §III-A, spec §3).
 
-A residual network with three stages of 64, 128 and 256 channels keeps an 4 × 8 map to its last
+A residual network with three stages of 64, 128 and 256 channels keeps a 4 × 8 map to its last
 layer, because a cart-pole is where things are: global average pooling would throw the positions
 away. Frames travel as uint8 [N, 2, H, W, 3] (previous, current), which is already channels-last
 memory, the layout the convolutions are fastest in.
 """
+
+import math
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +23,8 @@ def normalise(z: Tensor) -> Tensor:
     The cosine loss ignores lengths; fixing them here gives actor and predictors, which do see
     them, one scale for encoded and predicted embeddings.
     """
-    return F.normalize(z, dim=-1) * z.shape[-1] ** 0.5
+    unit: Tensor = F.normalize(z, dim=-1)
+    return unit * math.sqrt(z.shape[-1])
 
 
 class ResidualBlock(nn.Module):

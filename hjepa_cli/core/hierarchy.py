@@ -35,7 +35,7 @@ class Strides:
 
     h: int
     m: int
-    l: int  # noqa: E741 - the paper's symbol
+    l: int
 
     def __post_init__(self) -> None:
         if self.h < 1:
@@ -138,7 +138,7 @@ def plan_stride(
         Actions [N, h]; embeddings [N, h / l, D] on the finest grid they were taken at;
         the next anchor [N, D].
     """
-    h, m, l = strides.h, strides.m, strides.l  # noqa: E741
+    h, m, l = strides.h, strides.m, strides.l
     first = act(z)
     anchor = coarse(z, hold(first, h))
     embeddings, actions = [], []
@@ -169,7 +169,7 @@ def build_predictors(
     strides: Strides, embedding: int, hidden: int, *, all_actions: bool, residual: bool
 ) -> dict[str, Predictor]:
     """The three levels and the flat baseline ``ts-jepa-1``, keyed as in the checkpoint."""
-    h, m, l = strides.h, strides.m, strides.l  # noqa: E741
+    h, m, l = strides.h, strides.m, strides.l
 
     def level(steps: int, **anchoring: int) -> Predictor:
         return Predictor(

@@ -83,7 +83,7 @@ def medium_loss(
     left, right, actions, steps = high_gaps(
         high, data, h, horizon_steps=horizon_steps, trajectories=trajectories, generator=generator
     )
-    filled = fill_gap(medium, left, right, actions.unflatten(1, (h // m, m)))
+    filled = fill_gap(medium, left, right, split(actions, m))
     return cosine_loss(filled[:, 1:-1], interior(data, steps, h, m))
 
 
@@ -94,7 +94,7 @@ def low_loss(
     data: EmbeddedTrajectories,
     h: int,
     m: int,
-    l: int,  # noqa: E741 - the paper's symbol
+    l: int,
     *,
     horizon_steps: int,
     trajectories: int,
@@ -104,7 +104,7 @@ def low_loss(
     left, right, actions, steps = high_gaps(
         high, data, h, horizon_steps=horizon_steps, trajectories=trajectories, generator=generator
     )
-    by_medium = actions.unflatten(1, (h // m, m))
+    by_medium = split(actions, m)
     with torch.no_grad():
         grid = fill_gap(medium, left, right, by_medium)
     rows, begin = steps
@@ -113,7 +113,7 @@ def low_loss(
         low,
         grid[:, :-1].flatten(0, 1),
         grid[:, 1:].flatten(0, 1),
-        by_medium.flatten(0, 1).unflatten(1, (m // l, l)),
+        split(by_medium.flatten(0, 1), l),
     )
     targets = interior(data, (rows.repeat_interleave(h // m), begin), m, l)
     return cosine_loss(filled[:, 1:-1], targets)
@@ -154,3 +154,8 @@ def interior(
     rows, a = begin
     inside = a[:, None] + torch.arange(stride, gap, stride)
     return data.z[rows[:, None], inside]
+
+
+def split(actions: Tensor, stride: int) -> Tensor:
+    """Actions of gaps [G, steps] → of their sub-strides [G, steps / stride, stride]."""
+    return actions.reshape(len(actions), -1, stride)

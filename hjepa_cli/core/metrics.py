@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 SCORE_X_M = 0.05
 SCORE_THETA_RAD = 0.05
 COST_CAP = 50.0
-CONFIDENCE = 0.95
+TAILS = (0.025, 0.975)  # of a 95 % interval
 WINDOWS = ((1, 20), (21, 40), (41, 80), (81, 100))
 _BOOTSTRAP_KEY = 0xB007
 
@@ -58,10 +58,7 @@ def interval(replicates: Floats) -> Floats:
 
     Takes order statistics as they are, so that infinite replicates (no crossing) stay infinite.
     """
-    tail = (1 - CONFIDENCE) / 2
-    low = np.quantile(replicates, tail, axis=0, method="inverted_cdf")
-    high = np.quantile(replicates, 1 - tail, axis=0, method="inverted_cdf")
-    return np.stack([low, high])
+    return np.quantile(replicates, TAILS, axis=0, method="inverted_cdf")
 
 
 def mean_interval(values: Floats, weights: Floats) -> Floats:

@@ -114,15 +114,19 @@ _X, _Y, _ANGLE, _X_DOT, _Y_DOT, _ANGLE_DOT = range(6)
 _CART, _POLE = range(2)
 
 
-class _Batch:
-    """An array that pymunk reads from or writes to: ``[devices, 2, fields]``, carts and poles."""
+class _Writer:
+    """Writes ``[devices, 2, fields]`` (carts and poles) into a Space."""
 
-    def __init__(self, devices: int, fields: int) -> None:
-        # pymunk iterates over the space's static body too, after all the others.
-        memory = np.zeros((2 * devices + 1, fields))
-        self.buffer = pymunk.batch.Buffer()
-        self.buffer.set_float_buf(memory)
-        self.bodies: Floats = memory[:-1].reshape(devices, 2, fields)
+    def __init__(self, devices: int, fields: pymunk.batch.BodyFields, width: int) -> None:
+        # pymunk visits the Space's own static body too, after all the others.
+        memory = np.zeros((2 * devices + 1, width))
+        self.bodies: Floats = memory[:-1].reshape(devices, 2, width)
+        self._fields = fields
+        self._buffer = pymunk.batch.Buffer()
+        self._buffer.set_float_buf(memory)
+
+    def write(self, space: pymunk.Space) -> None:
+        pymunk.batch.set_space_bodies(space, self._fields, self._buffer)
 
 
 class CartPoles:
@@ -149,8 +153,9 @@ class CartPoles:
             raise UsageError(f"mass_scale must be {devices} × 2 positive factors")
         self._substep_s = self.plant.step_s / self.plant.substeps
         self._space = self._build(scale)
-        self._motion = _Batch(devices, 6)
-        self._force = _Batch(devices, 2)
+        self._motion = _Writer(devices, _MOTION, 6)
+        self._force = _Writer(devices, pymunk.batch.BodyFields.FORCE, 2)
+        self._reading = pymunk.batch.Buffer()
         self.states = np.zeros((devices, 4))
 
     def _build(self, mass_scale: Floats) -> pymunk.Space:
@@ -174,8 +179,10 @@ class CartPoles:
     @property
     def states(self) -> Floats:
         """The states ``[devices, 4]``: x [m], x_dot [m/s], theta [rad], theta_dot [rad/s]."""
-        pymunk.batch.get_space_bodies(self._space, _MOTION, self._reading())
-        cart, pole = self._motion.bodies[:, _CART], self._motion.bodies[:, _POLE]
+        self._reading.clear()
+        pymunk.batch.get_space_bodies(self._space, _MOTION, self._reading)
+        bodies = np.frombuffer(self._reading.float_buf())[: 12 * self.devices].reshape(-1, 2, 6)
+        cart, pole = bodies[:, _CART], bodies[:, _POLE]
         states = np.empty((self.devices, 4))
         states[:, 1] = cart[:, _X_DOT]
         states[:, 3] = -pole[:, _ANGLE_DOT]
@@ -203,7 +210,7 @@ class CartPoles:
         pole[:, _X_DOT] = x_dot + length_m * theta_dot * np.cos(theta)
         pole[:, _Y_DOT] = -length_m * theta_dot * np.sin(theta)
         pole[:, _ANGLE_DOT] = -theta_dot
-        pymunk.batch.set_space_bodies(self._space, _MOTION, self._motion.buffer)
+        self._motion.write(self._space)
 
     def step(self, forces_n: ArrayLike) -> None:
         """Advance by one control step of ``plant.step_s``, without noise.
@@ -214,15 +221,8 @@ class CartPoles:
         limit_n = self.plant.force_limit_n
         self._force.bodies[:, _CART, 0] = np.clip(forces_n, -limit_n, limit_n)
         for _ in range(self.plant.substeps):  # pymunk clears the forces after each
-            pymunk.batch.set_space_bodies(
-                self._space, pymunk.batch.BodyFields.FORCE, self._force.buffer
-            )
+            self._force.write(self._space)
             self._space.step(self._substep_s)
-
-    def _reading(self) -> pymunk.batch.Buffer:
-        """Empty the motion buffer, so that pymunk fills it from the start."""
-        self._motion.buffer.clear()
-        return self._motion.buffer
 
 
 class CartPole:

@@ -18,7 +18,6 @@ from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.jepa import Jepa
 from hjepa_cli.core.model import build_modules, encode_frames, tensors_of
-from hjepa_cli.core.plant import plant
 from hjepa_cli.core.predictors import Predictor
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
@@ -195,9 +194,7 @@ def examine(
     ahead = options.h // every if options.h % every == 0 else 1
     start, end = per_trajectory[:, :-ahead].flatten(0, 1), per_trajectory[:, ahead:].flatten(0, 1)
     with torch.no_grad():
-        sensitivity = health.action_sensitivity(
-            companion.cpu().eval(), start, end, steps=options.h
-        )
+        sensitivity = health.action_sensitivity(companion.cpu().eval(), start, end, steps=options.h)
         error = health.nrmse(actor.act(test_z), test.labels_at(every))
     companion.to(device).train()
     return {
@@ -211,7 +208,9 @@ def examine(
 
 def judge(report: dict[str, Any], options: EncoderSettings) -> dict[str, dict[str, Any]]:
     """Compare the health report with the stage gates of spec §3."""
-    lower_bounds = {f"probe_r2_{name}": getattr(options, f"gate_r2_{name}") for name in health.STATE_NAMES}
+    lower_bounds = {
+        f"probe_r2_{name}": getattr(options, f"gate_r2_{name}") for name in health.STATE_NAMES
+    }
     lower_bounds |= {
         "effective_rank": options.gate_rank,
         "action_sensitivity": options.gate_sensitivity,

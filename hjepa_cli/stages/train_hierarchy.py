@@ -13,10 +13,14 @@ import torch
 from torch import Tensor, nn
 
 from hjepa_cli.core import levels
+from hjepa_cli.core.bench import control_errors
 from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.hierarchy import Strides
 from hjepa_cli.core.levels import EmbeddedTrajectories
+from hjepa_cli.core.methods import embedding_method
+from hjepa_cli.core.metrics import window_means
 from hjepa_cli.core.model import Model, build_modules, encode_frames, load_modules, tensors_of
+from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import Optimiser, fit_actor, resolve_device
 from hjepa_cli.errors import DataError, MissingInputError
@@ -24,6 +28,7 @@ from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, versions
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
+from hjepa_cli.storage.datasets import Dataset
 from hjepa_cli.storage.runs import Run, newest_run, read_config
 from hjepa_cli.storage.zoo import resolve_model
 
@@ -90,7 +95,7 @@ def run(
             "checkpoint": str(path),
             "strides": {"h": strides.h, "m": strides.m, "l": strides.l},
             "seconds": round(time.perf_counter() - started, 2),
-            "nmae_windows": nmae_windows(model, settings),
+            "nmae_windows": nmae_windows(model, data, settings),
         }
         result = record.finish(result)
         screen.say(f"model {path} in {result['seconds']:.0f} s; next: hjepa eval")
@@ -166,9 +171,7 @@ def embed(
                 parts.append(z.unflatten(0, (len(part.frames), -1)))
                 bar.advance(len(part.frames))
             embedded.append(
-                EmbeddedTrajectories(
-                    torch.cat(parts).to(device), (sign * train.actions).to(device)
-                )
+                EmbeddedTrajectories(torch.cat(parts).to(device), (sign * train.actions).to(device))
             )
     return embedded[0], embedded[1]
 
@@ -184,9 +187,11 @@ def train_levels(
 ) -> None:
     """Train P^H, P^M, P^L and the flat baseline, in that order: each level builds on the last."""
     options = settings.hierarchy
-    h, m, l = strides.h, strides.m, strides.l  # noqa: E741
+    h, m, l = strides.h, strides.m, strides.l
     coarse_data = join(plain, mirrored)
-    fine_data = join(plain.first(options.fine_trajectories), mirrored.first(options.fine_trajectories))
+    fine_data = join(
+        plain.first(options.fine_trajectories), mirrored.first(options.fine_trajectories)
+    )
     stream = generator(settings.seed, STREAM)
     high, medium, low, flat = (modules[name] for name in ("high", "medium", "low", "flat"))
     common = {
@@ -237,3 +242,17 @@ def join(plain: EmbeddedTrajectories, mirrored: EmbeddedTrajectories) -> Embedde
     return EmbeddedTrajectories(
         torch.cat([plain.z, mirrored.z]), torch.cat([plain.actions, mirrored.actions])
     )
+
+
+def nmae_windows(model: Model, data: Dataset, settings: Settings) -> dict[str, float]:
+    """Prediction error of ``hjepa`` after a single packet, on the dataset's clean rollouts."""
+    clean = data.split("clean")
+    limit_n = plant(settings.plant).force_limit_n
+    errors = control_errors(
+        embedding_method("hjepa", model, settings.protocol.payload_bits_per_value),
+        clean.states.astype(float),
+        clean.teacher_n.astype(float),
+        limit_n,
+        min(settings.protocol.horizon, clean.steps - 1),
+    )
+    return {name: float(error.mean()) for name, error in window_means(errors).items()}
