@@ -57,7 +57,7 @@ def check_settings(settings: Settings) -> None:
         raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps, at least one")
 
 
-def check_strides(h: int, m: int, l: int) -> None:  # noqa: E741 - the paper's symbol
+def check_strides(h: int, m: int, l: int) -> None:
     """Check that the strides of the three levels nest: h a multiple of m, m a multiple of l.
 
     Raises:

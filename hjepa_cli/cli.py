@@ -277,7 +277,7 @@ def train_encoder(
 def train_hierarchy(
     h: options.StrideH = None,
     m: options.StrideM = None,
-    l: options.StrideL = None,  # noqa: E741 - the paper's symbol
+    l: options.StrideL = None,
     dataset: options.Dataset = None,
     encoder: options.Encoder = None,
     out: options.Out = None,

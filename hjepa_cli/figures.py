@@ -1,4 +1,4 @@
-"""Figures for papers: one column wide (3.5 in), readable in black and white, identical on every run.
+"""Figures for papers: one column wide (3.5 in), readable in black and white, equal byte for byte.
 
 This is the only module that imports matplotlib (extra ``plot``). Figures are built without pyplot,
 so no display, backend or global state is involved.

@@ -47,7 +47,7 @@ def refused(shell, code, *arguments, says=()):
         (2, 4, 1, "choose --m from 1, 2", "--h 2 --m 2 --l 1"),
     ],
 )
-def test_wrong_strides_name_the_right_ones(shell, h, m, l, choices, repaired):  # noqa: E741
+def test_wrong_strides_name_the_right_ones(shell, h, m, l, choices, repaired):
     strides = [f"--h={h}", f"--m={m}", f"--l={l}"]
     refused(shell, 2, "train-hierarchy", *strides, says=[choices, repaired])
 
@@ -283,13 +283,15 @@ def model(shell):
 
 @pytest.mark.parametrize("command", ["train-encoder", "train-hierarchy", "eval", "scale"])
 def test_dataset_that_is_not_there(shell, command):
-    refused(shell, 66, command, "--dataset", "nowhere", says=["nowhere", "hjepa collect"])
+    refused(
+        shell, 66, command, "--quiet", "--dataset", "nowhere", says=["nowhere", "hjepa collect"]
+    )
 
 
 @pytest.mark.parametrize("command", ["train-encoder", "train-hierarchy", "eval", "scale"])
 def test_empty_dataset_directory(shell, command):
     Path("empty").mkdir()
-    refused(shell, 65, command, "--dataset", "empty", says=["empty", "hjepa collect"])
+    refused(shell, 65, command, "--quiet", "--dataset", "empty", says=["empty", "hjepa collect"])
 
 
 @pytest.mark.parametrize("command", ["train-encoder", "train-hierarchy", "eval", "scale"])
@@ -297,7 +299,7 @@ def test_empty_dataset_directory(shell, command):
 def test_foreign_dataset_directory(shell, command, manifest):
     Path("foreign").mkdir()
     Path("foreign/dataset.json").write_text(manifest)
-    refused(shell, 65, command, "--dataset", "foreign", says=["foreign"])
+    refused(shell, 65, command, "--quiet", "--dataset", "foreign", says=["foreign"])
 
 
 def test_no_dataset_yet_names_the_command_that_makes_one(shell):

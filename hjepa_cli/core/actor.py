@@ -1,11 +1,11 @@
-"""The semantic actor: embedding → force, trained on the teacher's labels (paper §III-B, TS-JEPA)."""
+"""The semantic actor: embedding → force, trained on the teacher's labels (paper §III-A)."""
 
 import torch
 from torch import Tensor, nn
 
 
 class Actor(nn.Module):
-    """MLP D-1024-256-1 with ReLU and dropout; ``forward`` gives the force ÷ force limit, unclipped."""
+    """MLP D-1024-256-1 with ReLU and dropout; ``forward`` is force ÷ force limit, unclipped."""
 
     def __init__(self, embedding: int, hidden: int, dropout: float) -> None:
         super().__init__()

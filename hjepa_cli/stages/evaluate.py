@@ -51,9 +51,18 @@ class Subject:
     dataset: Dataset | None
 
     @property
+    def name(self) -> str:
+        """The model's path, for people."""
+        return str(self.path) if self.path else "no model"
+
+    @property
     def methods(self) -> tuple[str, ...]:
-        """The methods that can be measured."""
+        """All methods that can be measured."""
         return (*(self.model.methods if self.model else ()), *TRUE_STATE)
+
+    def measurable(self, methods: Sequence[str]) -> list[str]:
+        """Those of ``methods`` that can be measured, in their order."""
+        return [name for name in methods if name in self.methods]
 
     @property
     def digest(self) -> Digest:
@@ -72,6 +81,11 @@ class Subject:
     def skipped(self, methods: Sequence[str]) -> dict[str, str]:
         """The methods without a model, with what would train it."""
         return {name: _how_to_train(name, self) for name in methods if name not in self.methods}
+
+    def say_skipped(self, methods: Sequence[str], screen: Screen) -> None:
+        """Tell the user about them."""
+        for name, how in self.skipped(methods).items():
+            screen.say(f"{name} skipped, no model of it here: {how}")
 
 
 def run(
@@ -102,13 +116,13 @@ def run(
     check_methods(settings.methods)
     subject = open_subject(settings, screen, checkpoint, dataset)
     with Run.create("eval", out, settings.as_dict()) as record:
-        if record.result is None:
-            record.finish(_evaluate(subject, screen, record, settings.methods, remeasure))
+        result = record.result
+        if result is None:
+            result = record.finish(_evaluate(subject, screen, record, settings.methods, remeasure))
         else:
             screen.say(f"{record.directory} is finished; this is its result")
-        assert record.result is not None
-        show(record.result, screen)
-        return record.result
+        show(result, screen)
+        return result
 
 
 def curves_for(
@@ -131,16 +145,14 @@ def curves_for(
     """
     check_methods(tuple(methods))
     subject = open_subject(settings, screen, checkpoint, dataset)
-    name = str(subject.path or "no model")
     found = {} if remeasure else _cached(subject, methods)
-    missing = [name for name in methods if name in subject.methods and name not in found]
-    if not missing:
-        _say_skipped(subject, screen, methods)
-        entries = {name: found[name][0] for name in methods if name in found}
-        return name, entries, _source(found)
+    if all(method in found for method in subject.measurable(methods)):
+        subject.say_skipped(methods, screen)
+        entries = {method: found[method][0] for method in methods if method in found}
+        return subject.name, entries, _source(found)
     with Run.create("eval", None, settings.as_dict()) as record:
         result = record.finish(_evaluate(subject, screen, record, methods, remeasure))
-    return name, result["methods"], result["source"]
+    return subject.name, result["methods"], result["source"]
 
 
 def measure_points(
@@ -194,9 +206,7 @@ def open_subject(
 
 
 def show(result: dict[str, Any], screen: Screen) -> None:
-    """Print the table of an evaluation, and what it left out."""
-    for name, how in result["skipped"].items():
-        screen.say(f"{name} skipped: {how}")
+    """Print the table of an evaluation."""
     entries = result["methods"]
     if not entries:
         return
@@ -238,11 +248,12 @@ def _evaluate(
 ) -> dict[str, Any]:
     """Take what is cached, measure the rest, keep each method as soon as it is done."""
     settings = subject.settings
+    subject.say_skipped(methods, screen)
     own = record.path(CURVES_FILE)
     found = {} if remeasure else _cached(subject, methods)
     found |= {name: (entry, own) for name, entry in curves.read(own, subject.digest).items()}
     keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
-    missing = [name for name in methods if name in subject.methods and name not in found]
+    missing = [name for name in subject.measurable(methods) if name not in found]
     if missing:
         clean = _clean_rollouts(subject)
         with _ticking(screen, "eval teacher", settings.protocol.steps) as bar:
@@ -333,18 +344,12 @@ def _default_model(settings: Settings, screen: Screen) -> Path | None:
 
 
 def _cached(subject: Subject, methods: Sequence[str]) -> dict[str, tuple[Entry, Path]]:
-    wanted = [name for name in methods if name in subject.methods]
-    return curves.find(subject.digest, wanted, subject.beside)
+    return curves.find(subject.digest, subject.measurable(methods), subject.beside)
 
 
 def _source(found: dict[str, tuple[Entry, Path]]) -> str:
     paths = ", ".join(dict.fromkeys(str(path) for _, path in found.values()))
     return f"curves of {paths or 'nothing'}; --remeasure measures them again"
-
-
-def _say_skipped(subject: Subject, screen: Screen, methods: Sequence[str]) -> None:
-    for name, how in subject.skipped(methods).items():
-        screen.say(f"{name} skipped: {how}")
 
 
 def _how_to_train(method: str, subject: Subject) -> str:

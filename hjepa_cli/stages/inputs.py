@@ -1,4 +1,4 @@
-"""What training stages take in: a dataset that fits, its rendered frames, versions for the record."""
+"""What training stages take in: a dataset that fits, rendered frames, versions."""
 
 import dataclasses
 import platform

@@ -39,7 +39,7 @@ def run(
 
     Raises:
         MissingInputError: no dataset.
-        NumericalError: training diverged or a gate failed (unless ``settings.encoder.gate`` is off).
+        NumericalError: training diverged, or a gate failed (see ``settings.encoder.gate``).
     """
     data = open_dataset(dataset, settings)
     with Run.create("train-encoder", out, settings.as_dict()) as record:

@@ -1,0 +1,164 @@
+"""One radio cell full of control loops: what a loop needs of the link, and how many the cell fits.
+
+Joins a method's measured tolerance (spec §4) with a law of :mod:`hjepa_cli.core.capacity` and puts
+the count beside the bits that control needs in theory. The rows are those of ``scale --json``.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from hjepa_cli.core.capacity import (
+    Noise,
+    duty_devices,
+    equal_delivery_probability,
+    equal_devices,
+    late_slots,
+    slot_capacity,
+)
+
+Law = Literal["duty", "equal"]
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Need:
+    """What one loop of a method needs of the link to stay at the acceptable score.
+
+    Attributes:
+        tolerance: D* in steps (``duty``) or p* (``equal``); ``None`` for a method without a link.
+        interval: its 95 % interval, ordered so that device counts ascend.
+        at_least: the score was still acceptable where the measured range ends; there may be more.
+        payload_bits: b.
+        packets_per_slot: that reach the controller of a loop at its tolerance.
+    """
+
+    method: str
+    tolerance: float | None
+    interval: tuple[float, float] | None
+    at_least: bool
+    payload_bits: int | None
+    packets_per_slot: float | None
+
+    @classmethod
+    def under(cls, law: Law, method: str, entry: Mapping[str, Any]) -> "Need":
+        """Read a method's entry of ``eval --json``."""
+        key, kind = ("tolerance_gap_steps", "gap") if law == "duty" else ("tolerance_p", "p")
+        tolerance, interval = entry[key], entry[f"tolerance_{kind}_ci95"]
+        packets_per_slot = None
+        if tolerance:
+            packets_per_slot = 1 / tolerance if law == "duty" else tolerance
+        return cls(
+            method,
+            tolerance,
+            None
+            if interval is None
+            else (min(interval), max(interval))[:: 1 if law == "duty" else -1],
+            bool(entry[f"tolerance_{kind}_censored"]),
+            entry["bits_per_transmission"],
+            packets_per_slot,
+        )
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The radio cell.
+
+    Attributes:
+        law: ``"duty"`` or ``"equal"``.
+        noise: ``"fixed"`` or ``"scaled"``; only ``equal`` looks at it.
+        bandwidth_hz: W.
+        slot_s: τ_o, one control step.
+        limit_bits_per_s: λ/ln 2, what stabilising one plant takes at least.
+    """
+
+    law: Law
+    noise: Noise
+    bandwidth_hz: float
+    slot_s: float
+    limit_bits_per_s: float
+
+    def row(self, need: Need, snr_db: float) -> Row:
+        """Count one method's devices at one SNR."""
+        row: Row = {
+            "snr_db": snr_db,
+            "method": need.method,
+            "devices": None,
+            "devices_ci95": None,
+            "at_least": need.at_least,
+            "bits_per_s": None,
+            "ratio_to_limit": None,
+            "bits_per_transmission": need.payload_bits,
+            "tolerance": need.tolerance,
+            "tolerance_ci95": None if need.interval is None else sorted(need.interval),
+            "reason": None,
+        }
+        if need.tolerance is None or need.payload_bits is None:
+            return row | {"reason": "sees every state, whatever the link does"}
+        ends = need.interval or (need.tolerance, need.tolerance)
+        row["devices"] = self._devices(need.tolerance, need.payload_bits, snr_db)
+        row["devices_ci95"] = [self._devices(end, need.payload_bits, snr_db) for end in ends]
+        if need.packets_per_slot is not None:
+            row["bits_per_s"] = need.payload_bits * need.packets_per_slot / self.slot_s
+            row["ratio_to_limit"] = row["bits_per_s"] / self.limit_bits_per_s
+        if row["devices"] == 0:
+            row["reason"] = self._why_nobody(need.tolerance, need.payload_bits, snr_db)
+        return row
+
+    def _devices(self, tolerance: float, payload_bits: int, snr_db: float) -> int:
+        link = (payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
+        if self.law == "equal":
+            return int(equal_devices(tolerance, *link, noise=self.noise))
+        c = slot_capacity(*link)
+        # A packet that is late on arrival has used up that much of the gap it could have bridged.
+        return int(duty_devices(max(tolerance - float(late_slots(c)), 0.0), c))
+
+    def _why_nobody(self, tolerance: float, payload_bits: int, snr_db: float) -> str:
+        if tolerance == (0.0 if self.law == "duty" else 1.0):
+            return "below the acceptable score even with a packet in every slot"
+        link = (payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
+        if self.law == "duty":
+            slots = 1 / float(slot_capacity(*link))
+            return f"a packet takes {slots:.3g} slots and serves for {tolerance:.3g}"
+        p = float(equal_delivery_probability(1, *link, noise=self.noise))
+        return f"one device alone delivers with p = {p:.3g}, but needs {tolerance:.3g}"
+
+
+def gain(rows: Sequence[Row], method: str, over: str, snr_db: float) -> Row | None:
+    """Return the ratio of two methods' devices at one SNR; ``None`` where one has none.
+
+    Returns:
+        ``snr_db``, ``method``, ``over``, ``ratio``, ``ratio_ci95`` (``None``: unbounded above).
+    """
+    at = {row["method"]: row for row in rows if row["snr_db"] == snr_db and row["devices"]}
+    if method not in at or over not in at:
+        return None
+    above, below = ((at[name]["devices"], *at[name]["devices_ci95"]) for name in (method, over))
+    return {
+        "snr_db": snr_db,
+        "method": method,
+        "over": over,
+        "ratio": above[0] / below[0],
+        "ratio_ci95": ratio_interval(above, below),
+    }
+
+
+def ratio_interval(
+    above: tuple[float, float, float], below: tuple[float, float, float]
+) -> list[float | None]:
+    """Return the 95 % interval of a ratio of independent parts, each (value, low, high).
+
+    The method of variance estimates recovery (Zou and Donner, Statistics in Medicine 27, 2008) on
+    the logarithm, which keeps lopsided intervals lopsided. Methods share their draws, so that their
+    tolerances rise and fall together: this interval is then wider than it had to be.
+    """
+    a, a_low, a_high = (_log(value) for value in above)
+    b, b_low, b_high = (_log(value) for value in below)
+    low = a - b - math.hypot(a - a_low, b_high - b)
+    high = a - b + math.hypot(a_high - a, b - b_low)
+    return [math.exp(low), None if high == math.inf else math.exp(high)]
+
+
+def _log(value: float) -> float:
+    return math.log(value) if value > 0 else -math.inf
