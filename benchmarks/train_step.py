@@ -25,7 +25,7 @@ from torch.utils.data import DataLoader, Dataset
 from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.ema import EmaTarget
-from hjepa_cli.core.encoder import Encoder, normalise
+from hjepa_cli.core.encoder import CENTRE_OFFSET, Encoder, normalise
 from hjepa_cli.core.jepa import Jepa
 from hjepa_cli.core.losses import InverseDynamics, cosine_loss
 from hjepa_cli.core.predictors import Predictor
@@ -48,7 +48,8 @@ class PlainEncoder(nn.Module):
         net = self.encoder
         x = torch.relu(net.stem_norm(net.stem(x)))
         x = torch.relu(net.squeeze(net.stages(x)))
-        return normalise(net.centre(net.head(x.flatten(1))))
+        z = net.head(x.flatten(1))
+        return normalise(z if net.centre is None else net.centre(z) + CENTRE_OFFSET)
 
 
 class Windows(Dataset[tuple[Tensor, Tensor]]):

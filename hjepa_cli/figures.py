@@ -14,13 +14,14 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from hjepa_cli.errors import UsageError
 from hjepa_cli.storage.files import write_bytes
 
 WIDTH_IN = 3.5  # an IEEE column
 DPI = 300
+MARKERS = 8  # per line at most
 RC = {
     "font.size": 8,
     "axes.labelsize": 8,
@@ -84,12 +85,13 @@ def devices_figure(
         curves = _curves(rows)
         for method, points in sorted(curves.items(), key=lambda item: -item[1][-1, 1]):
             _draw(axes, method, points, _style(method, list(curves)))
-        counts = np.concatenate(list(curves.values()))[:, 1] if curves else np.zeros(1)
-        _scale_counts(axes, counts[counts > 0])
+        _scale_counts(axes, [row for row in rows if row["devices"]])
         axes.set_xlabel(snr_label)
         axes.set_ylabel("Supported devices")
         axes.set_title(title)
-        axes.set_xticks(_snr_ticks(curves))
+        grid_db = sorted({row["snr_db"] for row in rows})
+        if len(grid_db) <= MARKERS:
+            axes.set_xticks(grid_db)
         axes.grid(visible=True)
         figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=2.4)
         return figure
@@ -112,8 +114,7 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     curves: dict[str, list[list[float]]] = {}
     for row in rows:
         if row["devices"] is not None:
-            low, high = row["devices_ci95"] or (row["devices"], row["devices"])
-            point = [row["snr_db"], row["devices"], low, row["devices"] if high is None else high]
+            point = [row["snr_db"], row["devices"], *row["devices_ci95"]]
             curves.setdefault(row["method"], []).append(point)
     return {method: np.array(sorted(points), float) for method, points in curves.items()}
 
@@ -133,6 +134,7 @@ def _draw(axes: Axes, method: str, points: np.ndarray, style: Style) -> None:
         linestyle=style.line,
         marker=style.marker,
         markerfacecolor="none" if style.hollow else style.colour,
+        markevery=-(-len(points) // MARKERS),
         markersize=6.5 if style.hollow else 4,  # a ring stays visible around a filled marker
         label=label,
     )
@@ -142,18 +144,18 @@ def _draw(axes: Axes, method: str, points: np.ndarray, style: Style) -> None:
         axes.vlines(snr_db, low, high, color=style.colour)
 
 
-def _scale_counts(axes: Axes, counts: np.ndarray) -> None:
-    """Logarithmic where the methods lie more than a decade apart, else from zero."""
-    if counts.size and counts.max() > 10 * counts.min():
+def _scale_counts(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Logarithmic where methods lie more than a decade apart at one SNR, else from zero."""
+    at: dict[float, list[int]] = {}
+    for row in rows:
+        at.setdefault(row["snr_db"], []).append(row["devices"])
+    least = min((row["devices"] for row in rows), default=1)
+    most = max((row["devices_ci95"][1] for row in rows), default=1)
+    if any(max(counts) > 10 * min(counts) for counts in at.values()):
         axes.set_yscale("log", nonpositive="clip")
-        axes.set_ylim(0.7 * counts.min(), 1.5 * counts.max())
+        axes.set_ylim(0.7 * least, 1.5 * most)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.grid(visible=True, which="minor", axis="y", alpha=0.2)
     else:
-        axes.set_ylim(0, 1.1 * counts.max(initial=1.0))
+        axes.set_ylim(0, 1.1 * most)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-
-
-def _snr_ticks(curves: Mapping[str, np.ndarray]) -> list[float]:
-    values = sorted({snr_db for points in curves.values() for snr_db in points[:, 0]})
-    return values[:: max(1, -(-len(values) // 8))]

@@ -148,7 +148,7 @@ def test_low_base_stations_do_not_look_at_heights():
 
 
 def outage_as_printed(power_w, loss_db, noise_w, rate_bps, bandwidth_hz):
-    """The paper's eq. "outage", letter for letter."""
+    """The paper's eq. 4, letter for letter."""
     return 1 - math.exp(
         -(10 ** (loss_db / 10)) * (noise_w / power_w) * (2 ** (rate_bps / bandwidth_hz) - 1)
     )

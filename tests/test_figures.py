@@ -112,14 +112,16 @@ def test_rows_in_any_order_give_the_same_lines():
     assert list(backwards["hjepa"].get_xdata()) == [10, 15, 20]
 
 
-def test_a_decade_apart_is_logarithmic_and_close_counts_start_at_zero():
-    assert figures.devices_figure(rows(METHODS[:3])).axes[0].get_yscale() == "linear"
-    assert figures.devices_figure(rows(METHODS[:3])).axes[0].get_ylim()[0] == 0
-    assert figures.devices_figure(rows()).axes[0].get_yscale() == "log"
+def test_methods_a_decade_apart_are_logarithmic_and_close_ones_start_at_zero():
+    close = rows(METHODS[:3], snr_db=(1.0, 20.0))  # a decade apart by SNR only
+    assert figures.devices_figure(close).axes[0].get_yscale() == "linear"
+    assert figures.devices_figure(close).axes[0].get_ylim()[0] == 0
+    far = rows(METHODS[:2], snr_db=(20.0,)) + rows(["oracle"], snr_db=(20.0,), scale=2000.0)
+    assert figures.devices_figure(far).axes[0].get_yscale() == "log"
 
 
 def test_nothing_is_cut_off():
-    for data in (rows(), rows(METHODS[:3]), rows(spread=0.9)):
+    for data in (rows(), rows(scale=1e4)[:8] + rows()[8:], rows(spread=0.9)):
         axes = figures.devices_figure(data).axes[0]
         low, high = axes.get_ylim()
         counts = [row["devices"] for row in data]

@@ -76,8 +76,8 @@ def test_the_final_bracket_is_narrow_and_measured_with_many(tolerance: float) ->
     fake.curves()
     for kind in KINDS:
         gaps = sorted(fake.gaps_with_many(kind))
-        left = max(gap for gap in gaps if gap <= tolerance)
-        right = min(gap for gap in gaps if gap > tolerance)
+        left = max(gap for gap in gaps if gap <= tolerance * (1 + 1e-9))
+        right = min(gap for gap in gaps if gap >= tolerance * (1 - 1e-9))
         assert right / left - 1 <= PROTOCOL.bracket
         assert len(gaps) <= 9
 

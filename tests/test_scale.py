@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import sys
 from types import SimpleNamespace
 
@@ -51,8 +52,12 @@ def stage(tmp_path, monkeypatch):
         flags = {"radio.snr_db": snr, "radio.law": law, "methods": methods} | (config or {})
         call.out, call.err = io.StringIO(), io.StringIO()
         screen = Screen(quiet, stdout=call.out, stderr=call.err)
-        return scale.run(load_settings(flags=flags), screen, **arguments)
+        with monkeypatch.context() as patch:
+            if not call.figures:  # half a second each
+                patch.setattr(scale, "draw", lambda *ignored: [])
+            return scale.run(load_settings(flags=flags), screen, **arguments)
 
+    call.figures = False
     call.curves = calls
     return call
 
@@ -105,11 +110,11 @@ def test_tables_show_every_method_and_snr_in_80_columns(stage):
         printed = stage.out.getvalue()
         tables = [line for line in printed.splitlines() if "paper" not in line]
         assert max(map(len, tables)) <= 80
-        for text in (*ENTRIES, "10 dB", "15 dB", "20 dB", "25 dB", "30 dB", "× limit"):
+        for text in (*ENTRIES, "10 dB", "15 dB", "20 dB", "25 dB", "30 dB", "÷limit"):
             assert text in printed, text
     stage()
     assert "112.0 (100.8 – 123.2)" in stage.out.getvalue()
-    assert "7225 (6502 – 7948)" in stage.out.getvalue()
+    assert "7225 (6503 – 7948)" in stage.out.getvalue()
     assert "320.0 (at least)" in stage.out.getvalue()
     stage(law="equal")
     assert "0.0100 (at most)" in stage.out.getvalue()
@@ -129,8 +134,10 @@ def test_csv_is_the_table_in_long_format(stage):
 
 def test_results_do_not_depend_on_the_run(stage, tmp_path):
     """Equal curves give equal files, byte for byte."""
+    stage.figures = True
     first, second = stage(), stage()
     assert first["csv"] != second["csv"]
+    assert len(first["figures"]) == 2
     for a, b in zip(
         [first["csv"], *first["figures"]], [second["csv"], *second["figures"]], strict=True
     ):
@@ -138,6 +145,7 @@ def test_results_do_not_depend_on_the_run(stage, tmp_path):
 
 
 def test_the_run_directory_holds_everything(stage, tmp_path):
+    stage.figures = True
     stage(out=tmp_path / "here")
     names = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"devices.csv", "devices.png", "devices.svg", "config.toml", "result.json"} <= names
@@ -159,6 +167,7 @@ def test_flags_reach_the_curves(stage, tmp_path):
 
 
 def test_without_matplotlib_the_table_stays_and_the_pip_line_is_named(stage, monkeypatch):
+    stage.figures = True
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.delitem(sys.modules, "hjepa_cli.figures", raising=False)
     monkeypatch.delattr("hjepa_cli.figures", raising=False)
@@ -247,3 +256,33 @@ def test_verify_asks_for_no_more_than_a_packet_in_every_slot(stage, blocks, monk
     stage(verify=True, methods=("zero",), law="equal")
     (_, gaps, _), (_, _, probabilities) = blocks.asked
     assert gaps == pytest.approx([1.155]) and probabilities == pytest.approx([0.855])
+
+
+def test_real_curves_of_the_true_state_methods(tmp_path, monkeypatch):
+    """Nothing replaced: measure, count, draw, and take the same curves again from the cache."""
+    monkeypatch.chdir(tmp_path)
+    settings = load_settings(
+        "smoke",
+        flags={
+            "methods": ("hold-true", "optimal"),
+            "radio.snr_db": "20:20",
+            "protocol.steps": 120,
+            "protocol.gaps": (1, 40, 80),
+        },
+    )
+    first, again = (
+        scale.run(settings, Screen(stdout=io.StringIO(), stderr=io.StringIO())) for _ in range(2)
+    )
+    assert again["rows"] == first["rows"]
+    assert len(list(tmp_path.glob("runs/eval/*"))) == 1
+    (curves,) = tmp_path.glob("runs/eval/*/curves.json")
+    measured = json.loads(curves.read_text())["methods"]["hold-true"]
+    tolerance = measured["tolerance_gap_steps"]
+    assert 1 < tolerance <= 80
+    hold = by_method(first)["hold-true"]
+    bits = measured["bits_per_transmission"]
+    assert bits == 2064
+    c = 20_000 * math.log2(101) / bits
+    assert hold["devices"] == math.floor(tolerance * c)
+    assert hold["bits_per_s"] == pytest.approx(bits / (tolerance * 1e-3))
+    assert by_method(first)["optimal"]["devices"] is None

@@ -36,7 +36,7 @@ BACKGROUND_RGB = (255, 255, 255)
 CART_RGB = (0, 114, 178)
 POLE_RGB = (160, 0, 0)
 
-_CHUNK = 64  # frames drawn together: few calls, and the work stays in the cache
+_CHUNK = 32  # frames drawn together: few calls, and the work stays in the cache
 _SUBPIXELS = 2.0**20
 _UPRIGHT_PX = 2.0**-17  # an edge that leans less inside a pixel row is spread over this much
 _PIXEL = np.dtype("V3")  # one RGB pixel, copied as a whole
@@ -219,10 +219,15 @@ class _Pole:
 
         bounds = np.asarray(b_bounds, float)
         total = np.zeros(bounds.shape)
+        far, near = np.empty_like(bounds), np.empty_like(bounds)  # reused: twice as fast
         for edge in range(len(_CORNER_ENDS)):
-            far = np.maximum(b_stop[:, edge, :, None] - bounds, 0.0)
-            near = np.maximum(b_start[:, edge, :, None] - bounds, 0.0)
-            total += (far * far - near * near) * weight[:, edge, :, None]
+            for end, distance in ((b_stop, far), (b_start, near)):
+                np.subtract(end[:, edge, :, None], bounds, out=distance)
+                np.maximum(distance, 0.0, out=distance)
+                distance *= distance
+            far -= near
+            far *= weight[:, edge, :, None]
+            total += far
         return np.abs(total[..., :-1] - total[..., 1:])
 
     def of(self, frames: Integers) -> "_Pole":
@@ -271,9 +276,7 @@ class _Canvas:
             colours[..., channel] = np.rint(colour)
         self.pixels[self._places(upright, lines, band)] = colours.view(_PIXEL)[..., 0]
 
-    def _places(
-        self, upright: NDArray[np.bool_], lines: Integers, band: Integers
-    ) -> Integers:
+    def _places(self, upright: NDArray[np.bool_], lines: Integers, band: Integers) -> Integers:
         """Index ``[n, A, B]`` into ``pixels``; the last pixel stands for all that is cut off."""
         towards = np.where(self.mirrored, -1, 1)
         column = np.where(self.mirrored, WIDTH_PX - 1 - self.columns, self.columns)
@@ -295,7 +298,8 @@ class _Canvas:
 
 def _overlap(pixel: Integers, low: Floats, high: Floats) -> Floats:
     """Return how much of pixel … pixel + 1 lies within low … high."""
-    return np.maximum(np.minimum(pixel + 1, high) - np.maximum(pixel, low), 0.0)
+    overlap: Floats = np.minimum(pixel + 1, high) - np.maximum(pixel, low)
+    return np.maximum(overlap, 0.0)
 
 
 def _swap(condition: NDArray[np.bool_], first: Any, second: Any) -> tuple[Any, Any]:

@@ -1,7 +1,7 @@
 """The uplink channel: indoor-factory path loss, Rayleigh block fading, rate and outage.
 
 Large scale: 3GPP TR 38.901, indoor factory (InF), clauses 7.4.1 and 7.4.2. Small scale and outage:
-the paper's system model, eqs. "SNR", "UL rate" and "outage" of section II-B. Distances in metres,
+the paper's system model, eqs. 2 to 4 of section II-B. Distances in metres,
 carrier in GHz, powers in dBm, ratios in dB; every function broadcasts over numpy arrays and returns
 a float64 scalar for scalar input. ``docs/radio.md`` lists the assumptions.
 """
@@ -147,7 +147,7 @@ def received_snr_db(
     noise_dbm: npt.ArrayLike,
     power_gain: npt.ArrayLike = 1.0,
 ) -> FloatArray:
-    """Return γ = 10^(−PL/10) P |H|² / N_c in dB (paper, eq. "SNR").
+    """Return γ = 10^(−PL/10) P |H|² / N_c in dB (paper, eq. 2).
 
     Args:
         power_dbm: P, transmit power.
@@ -170,7 +170,7 @@ def rayleigh_power_gains(rng: np.random.Generator, shape: int | tuple[int, ...])
 
 
 def achievable_rate_bps(bandwidth_hz: npt.ArrayLike, snr_db: npt.ArrayLike) -> FloatArray:
-    """Return the capacity W log2(1 + γ) in bit/s (paper, eq. "UL rate")."""
+    """Return the capacity W log2(1 + γ) in bit/s (paper, eq. 3)."""
     bandwidth = _positive("bandwidth", bandwidth_hz)
     return np.asarray(bandwidth * np.log1p(snr_ratio(snr_db)) / math.log(2.0))[()]
 
@@ -178,7 +178,7 @@ def achievable_rate_bps(bandwidth_hz: npt.ArrayLike, snr_db: npt.ArrayLike) -> F
 def outage_probability(
     rate_bps: npt.ArrayLike, bandwidth_hz: npt.ArrayLike, mean_snr_db: npt.ArrayLike
 ) -> FloatArray:
-    """Return ε = P[W log2(1 + γ̄ |H|²) < R̄] = 1 − exp(−(2^(R̄/W) − 1) / γ̄) (paper, eq. "outage").
+    """Return ε = P[W log2(1 + γ̄ |H|²) < R̄] = 1 − exp(−(2^(R̄/W) − 1) / γ̄) (paper, eq. 4).
 
     Args:
         rate_bps: R̄, the rate that must be carried: payload bits per slot duration.

@@ -15,8 +15,7 @@ from torch.nn import functional as F
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 STEM_PX = 4
 MAP_CHANNELS = 32
-import os
-BIAS = float(os.environ.get('BIAS','0'))
+CENTRE_OFFSET = 1.0
 
 
 def normalise(z: Tensor) -> Tensor:
@@ -54,7 +53,10 @@ class Encoder(nn.Module):
         frame_input: ``"difference"`` feeds [current, current − previous], each standardised by
             its own training statistics, which makes the sub-pixel velocity signal visible;
             ``"pair"`` feeds [current, previous] (the paper).
-        centre: batch-normalise z (no affine) before its length is fixed.
+        centre: batch-normalise z (no affine) before its length is fixed, then add a constant to
+            every value. Centred embeddings alone have no direction at the mean state, the upright
+            pole of all states; with an offset as long as themselves, fixing their length bends
+            them little there and the states stay linearly readable (docs/LOG.md).
     """
 
     input_mean: Tensor
@@ -73,7 +75,7 @@ class Encoder(nn.Module):
         map_size = (HEIGHT_PX // (STEM_PX * 4)) * (WIDTH_PX // (STEM_PX * 4))
         self.squeeze = nn.Conv2d(256, MAP_CHANNELS, 1)
         self.head = nn.Linear(MAP_CHANNELS * map_size, embedding)
-        self.centre = nn.BatchNorm1d(embedding, affine=False) if centre else nn.Identity()
+        self.centre = nn.BatchNorm1d(embedding, affine=False) if centre else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def fit_standardisation(self, frames: Tensor) -> None:
@@ -92,7 +94,8 @@ class Encoder(nn.Module):
         offset = -(weight * self.input_mean[:, None, None]).sum((1, 2, 3))
         x = F.relu(self.stem_norm(F.conv2d(x, weight, offset, stride=STEM_PX)))
         x = F.relu(self.squeeze(self.stages(x)))
-        return normalise(self.centre(self.head(x.flatten(1)).float()) + BIAS)
+        z = self.head(x.flatten(1)).float()
+        return normalise(z if self.centre is None else self.centre(z) + CENTRE_OFFSET)
 
     def _inputs(self, frames: Tensor) -> Tensor:
         """Both inputs [N, 6, H, W] in bfloat16: pixels and their differences are exact in it."""

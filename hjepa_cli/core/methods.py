@@ -7,7 +7,9 @@ and dequantised. Methods on the true state are anchors: what prediction could ga
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -96,19 +98,25 @@ def true_state(previous: Floats, states: Floats) -> Floats:
 
 
 def embedding_sensor(model: "Model", bits_per_value: int) -> Callable[[Floats, Floats], Tensor]:
-    """Sensor: render the last two frames, encode, quantise, dequantise."""
+    """Sensor: render the last two frames, encode, quantise, dequantise.
+
+    Devices are shared out to one thread per core; each renders and encodes its own.
+    """
     camera = Camera(plant(model.plant_name))
+    workers = os.cpu_count() or 1
+    pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+
+    def sense_some(pair: Floats) -> Tensor:
+        frames = camera.render(pair.reshape(-1, 4))
+        z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
+        return quantise(z, bits_per_value)
 
     def sense(previous: Floats, states: Floats) -> Tensor:
         """States [m, 4] one step before and now → received embeddings [m, D]."""
-        parts = []
-        for start in range(0, len(states), SENSOR_BATCH):
-            chunk = slice(start, start + SENSOR_BATCH)
-            pair = np.stack([previous[chunk], states[chunk]], axis=1)
-            frames = camera.render(pair.reshape(-1, 4))
-            z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
-            parts.append(quantise(z, bits_per_value))
-        return torch.cat(parts).to(model.device)
+        pairs = np.stack([previous, states], axis=1)
+        size = min(SENSOR_BATCH, -(-len(pairs) // workers))
+        parts = [pairs[start : start + size] for start in range(0, len(pairs), size)]
+        return torch.cat(list(pool.map(sense_some, parts))).to(model.device)
 
     return sense
 

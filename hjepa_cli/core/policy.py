@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 THETA_LIMIT_RAD = 1.2
 THETA_DOT_LIMIT_RAD_S = 25.0
-CELLS = (48, 50)  # of the gain table over theta and theta_dot; even, so that 0 is a node
+CELLS = (96, 100)  # of the gain table over theta and theta_dot; even, so that 0 is a node
 
 
 def teacher(preset: Plant | str) -> Callable[[ArrayLike], Floats]:
@@ -39,7 +39,7 @@ def teacher(preset: Plant | str) -> Callable[[ArrayLike], Floats]:
 
 def linear_gain(plant: Plant) -> Floats:
     """Return the LQR gain ``[4]`` at the origin, for u = −K x."""
-    return gains(plant, np.zeros(1), np.zeros(1))[0]
+    return gains(plant, np.zeros(1), np.zeros(1)).reshape(4)
 
 
 def gains(plant: Plant, theta: Floats, theta_dot: Floats) -> Floats:
@@ -60,9 +60,7 @@ def gains(plant: Plant, theta: Floats, theta_dot: Floats) -> Floats:
     return _continuous_gain(a, b, q, r)
 
 
-def state_dependent_form(
-    plant: Plant, theta: Floats, theta_dot: Floats
-) -> tuple[Floats, Floats]:
+def state_dependent_form(plant: Plant, theta: Floats, theta_dot: Floats) -> tuple[Floats, Floats]:
     """Return A ``[n, 4, 4]`` and B ``[n, 4, 1]`` of the exact factorisation ẋ = A x + B u."""
     total_kg = plant.cart_mass_kg + plant.pole_mass_kg
     length_m, pole_kg = plant.half_length_m, plant.pole_mass_kg
@@ -93,11 +91,12 @@ def _teacher(plant: Plant) -> Callable[[ArrayLike], Floats]:
         flat = states.reshape(-1, 4)
         place = (np.clip(flat[:, 2:], -limits, limits) + limits) * per_cell
         cell = np.minimum(place.astype(np.intp), last)
-        s, t = (place - cell).T
-        c = cells[cell[:, 0] * CELLS[1] + cell[:, 1]]  # [n, 4 coefficients, 4 states]
-        c = np.matmul(c, flat[:, :, None])[..., 0]
-        force = -(c[:, 0] + s * c[:, 1] + t * (c[:, 2] + s * c[:, 3]))
-        return np.clip(force, -plant.force_limit_n, plant.force_limit_n).reshape(states.shape[:-1])
+        s, t = (place - cell).T[:, :, None]
+        c = cells[cell[:, 0] * CELLS[1] + cell[:, 1]].transpose(1, 0, 2)
+        x, x_dot, theta, theta_dot = ((c[0] + s * c[1] + t * (c[2] + s * c[3])) * flat).T
+        # K x, written out so that a state's force does not depend on the batch it comes in.
+        force: Floats = -(x + x_dot + theta + theta_dot)
+        return force.clip(-plant.force_limit_n, plant.force_limit_n).reshape(states.shape[:-1])
 
     return force_n
 

@@ -1,14 +1,14 @@
 """The measuring protocol: curves over the gap and over the delivery probability, and tolerances.
 
 A curve is measured on a grid with few devices; where it crosses the acceptable score it is
-measured again with more, bisecting until the crossing is bracketed to a few per cent (spec §4).
+measured again with more, until the crossing is bracketed to a few per cent (spec §4).
 Both curves live on one axis, the mean gap g between packets in steps: D = g for the gap curve,
 p = 1/g for the delivery curve, whose crossing is interpolated in ln p instead of in D.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from hjepa_cli.settings import ProtocolSettings
 Floats = NDArray[np.float64]
 
 KINDS = ("gap", "delivery")
+STEP_OUT = 4  # brackets that a search goes outwards at a time, to find the end of an interval
+MAX_GUESSES = 4  # points of a search placed by interpolation, before it bisects
 
 @dataclasses.dataclass(frozen=True)
 class Point:
@@ -172,7 +174,7 @@ class Search:
         gaps = sorted(scores)
         left, right = _bracket(gaps, [scores[gap] for gap in gaps], self._level)
         if left is not None and right is not None and right / left - 1 > self._bracket:
-            return self._middle(left, right)
+            return self._between(left, right, scores)
         for end in (left, right):
             if end is not None and end not in self._measured:
                 return end
@@ -189,8 +191,14 @@ class Search:
         return None
 
     def _towards(self, edge: float, neighbour: float) -> float:
-        near = max(edge, neighbour) / min(edge, neighbour) - 1 <= self._bracket
-        return neighbour if near else self._middle(edge, neighbour)
+        """A step outwards: some brackets wide, at most half of the way, or all of a short way."""
+        width = 1 + self._bracket
+        way = neighbour / edge
+        if 1 / width <= way <= width:
+            return neighbour
+        step = self._middle(edge, neighbour) / edge
+        far = 1 + STEP_OUT * self._bracket
+        return edge * (min(step, far) if way > 1 else max(step, 1 / far))
 
     def _best_known(self) -> dict[float, float]:
         """Scores by gap: with many devices where measured, else the grid's."""
@@ -207,6 +215,21 @@ class Search:
     def _cross(self, scores: Floats) -> Floats:
         gaps = np.array(sorted(self._measured))
         return metrics.first_crossing(gaps, scores, self._level, log=self._log)
+
+    def _between(self, left: float, right: float, scores: Mapping[float, float]) -> float:
+        """Where to cut a bracket that is too wide.
+
+        At the interpolated crossing, but a bracket's width away from either end: near an end that
+        closes the bracket at once. In the middle where the bracket is short, and when guessing
+        has not helped.
+        """
+        width = 1 + self._bracket
+        if len(self._measured) >= MAX_GUESSES or right / left <= width**2:
+            return self._middle(left, right)
+        ends = np.array([left, right])
+        values = np.array([scores[left], scores[right]])
+        guess = float(metrics.first_crossing(ends, values, self._level, log=self._log))
+        return min(max(guess, left * width), right / width)
 
     def _middle(self, left: float, right: float) -> float:
         return math.sqrt(left * right) if self._log else (left + right) / 2

@@ -209,7 +209,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
     screen.table(
         f"one {result['plant']} loop at score {level:g}; "
         f"limit λ/ln 2 = {result['limit_bits_per_s']:.1f} bit/s",
-        ["method", "gap D* [steps]" if duty else "delivery p*", "bits", "bit/s", "× limit"],
+        ["method", "gap D* [steps]" if duty else "delivery p*", "bits", "bit/s", "÷limit"],
         [
             [
                 method,
@@ -265,9 +265,9 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
 
 
 def _described(result: Mapping[str, Any]) -> str:
-    noise = ", scaled noise" if (result["law"], result["noise"]) == ("equal", "scaled") else ""
-    width, slot = result["bandwidth_hz"] / 1e6, result["slot_s"] * 1e3
-    return f"law {result['law']}{noise}, {width:g} MHz, {slot:g} ms slots"
+    scaled = result["law"] == "equal" and result["noise"] == "scaled"
+    law = f"{result['law']} law{', scaled noise' if scaled else ''}"
+    return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
 
 
 def _percent(ratio: float | None) -> str:
