@@ -130,8 +130,16 @@ def _execute(
     planned: Callable[[], plan.Plan] | None = None,
     *,
     dry_run: bool = False,
+    product: str | None = None,
 ) -> None:
-    """Run a stage, or show its plan, and print what it returns."""
+    """Run a stage, or show its plan, and print what it returns.
+
+    Args:
+        stage: the work.
+        planned: its plan.
+        dry_run: show the plan only.
+        product: key of the result that a quiet run prints: the path that it made.
+    """
     with _guard():
         if dry_run and planned is not None:
             planned().show(screen)
@@ -139,10 +147,8 @@ def _execute(
         result = stage()
         if screen.json:
             screen.emit(result)
-        elif screen.quiet:  # otherwise the stage has said where its result is
-            for name in ("dataset", "checkpoint"):
-                if name in result:
-                    screen.result(str(result[name]))
+        elif screen.quiet and product is not None:  # otherwise the stage has said where it is
+            screen.result(str(result[product]))
 
 
 @contextmanager
@@ -228,7 +234,9 @@ def collect(
 
         return run(settings, screen, out=out)
 
-    _execute(screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run)
+    _execute(
+        screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run, product="dataset"
+    )
 
 
 @app.command("train-encoder", rich_help_panel=PIPELINE)
@@ -269,7 +277,11 @@ def train_encoder(
         return run(settings, screen, dataset=dataset, out=out)
 
     _execute(
-        screen, stage, lambda: plan.plan_train_encoder(settings, dataset, out), dry_run=dry_run
+        screen,
+        stage,
+        lambda: plan.plan_train_encoder(settings, dataset, out),
+        dry_run=dry_run,
+        product="checkpoint",
     )
 
 
@@ -316,6 +328,7 @@ def train_hierarchy(
         stage,
         lambda: plan.plan_train_hierarchy(settings, dataset, encoder, out),
         dry_run=dry_run,
+        product="checkpoint",
     )
 
 

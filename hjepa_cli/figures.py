@@ -22,7 +22,7 @@ from hjepa_cli.storage.files import write_bytes
 WIDTH_IN = 3.5  # an IEEE column
 DPI = 300
 MARKERS = 8  # per line at most
-RC = {
+RC: dict[Any, Any] = {
     "font.size": 8,
     "axes.labelsize": 8,
     "axes.titlesize": 7,

@@ -37,13 +37,13 @@ def show_info(screen: Screen, name_or_path: str) -> Result:
     """
     model = verify_model(name_or_path)
     metadata = model.metadata
-    rows: list[list[object]] = [[key, value] for key, value in _summary(model).items()]
+    rows: list[list[object]] = [[key, value] for key, value in _flat(_summary(model))]
     for key in ("stage", "seed", "dataset", "encoder"):
         if key in metadata:
             rows.append([key, metadata[key]])
     for section in ("architecture", "health", "versions"):
         rows += [[f"{section}.{key}", value] for key, value in _flat(metadata.get(section))]
-    screen.table(f"Model {model.name}", ["", "value"], [[key, str(value)] for key, value in rows])
+    screen.table(f"Model {model.name}", ["", "value"], rows)
     return {**_summary(model), "metadata": metadata}
 
 
@@ -64,8 +64,8 @@ def verify(screen: Screen, names: list[str]) -> Result:
         else:
             verified.append(_summary(model))
             screen.result(f"{name}: intact, sha256 {model.digest}")
-    for error in damaged[1:]:
-        screen.say(error.message)
+    for further in damaged[1:]:
+        screen.say(further.message)
     if damaged:
         raise damaged[0]
     return {"verified": verified}

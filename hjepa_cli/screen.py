@@ -273,11 +273,11 @@ def layout(columns: Sequence[str], rows: Sequence[Sequence[str]], available: int
     longest = [max((len(row[index]) for row in rows), default=0) for index in range(len(columns))]
     words = [max((len(word) for word in name.split()), default=0) for name in columns]
     widths = [max(pair) for pair in zip(longest, words, strict=True)]
-    if sum(widths) + GAP * (len(widths) - 1) > available:
-        widths = [
-            width if number else max(word, min(width, FOLD_AT))
-            for width, word, number in zip(widths, words, right, strict=True)
-        ]
+    while sum(widths) + GAP * (len(widths) - 1) > available:
+        foldable = [i for i, width in enumerate(widths) if not right[i] and width > FOLD_AT]
+        if not foldable:
+            break
+        widths[max(foldable, key=widths.__getitem__)] -= 1
     lines: list[str] = []
     for block in _blocks(widths, available):
 
@@ -315,9 +315,9 @@ def _blocks(widths: Sequence[int], available: int) -> list[list[int]]:
 
 def _is_number(cell: str) -> bool:
     """Set right-aligned: numbers, also bounds (>320) or with an interval after them, and blanks."""
-    first, *_ = cell.split() or [MISSING]
+    first, *_ = cell.lstrip("<>≤≥~ ").split() or [MISSING]
     try:
-        return first == MISSING or math.isfinite(float(first.lstrip("<>≤≥~").replace(",", "")))
+        return first == MISSING or math.isfinite(float(first.replace(",", "")))
     except ValueError:
         return False
 

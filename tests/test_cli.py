@@ -527,6 +527,80 @@ def test_models_of_an_unknown_name_lists_the_zoo(shell, zoo):
     assert_one_line_error(shell("models", "info", "god"), 66, "god", "good")
 
 
+# --- the whole program
+
+TINY = """
+[collect]
+trajectories = 6
+test_trajectories = 4
+clean_trajectories = 2
+[encoder]
+steps = 2
+[actor]
+epochs = 1
+[hierarchy]
+coarse_steps = 2
+medium_steps = 2
+low_steps = 2
+[protocol]
+steps = 50
+curve_devices = 4
+bracket_devices = 8
+gaps = [1, 20]
+bootstrap = 50
+"""
+
+
+@pytest.mark.slow
+def test_the_five_lines_from_pixels_to_device_counts(shell):
+    """The real stages, in an empty directory, each finding what the one before has left.
+
+    Preset smoke, made smaller still: does it run, and are the documents those of the contract?
+    """
+    Path("tiny.toml").write_text(TINY)
+    small = ("--preset", "smoke", "--config", "tiny.toml", "--json")
+
+    def document(line):
+        outcome = shell(*line.split()[1:], *small)
+        assert outcome.code == 0, outcome.err
+        return outcome.document
+
+    collected = document("hjepa collect --trajectories 6")
+    assert collected.keys() >= {"dataset", "test_trajectories", "seconds", "frames_per_s"}
+    assert (collected["trajectories"], collected["steps"]) == (6, load_settings().collect.steps)
+    assert (Path(collected["dataset"]) / "dataset.json").is_file()
+
+    encoder = document("hjepa train-encoder")
+    assert encoder["health"]["probe_r2"].keys() == {"x", "x_dot", "theta", "theta_dot"}
+    assert encoder["health"].keys() >= {"effective_rank", "action_sensitivity", "actor_nrmse"}
+    for gate in encoder["gates"].values():
+        assert gate.keys() >= {"value", "threshold", "passed"}
+
+    model = document("hjepa train-hierarchy --h 4 --m 2 --l 1")
+    assert model["strides"] == {"h": 4, "m": 2, "l": 1}
+    assert "1-20" in model["nmae_windows"]
+    assert shell("models", "verify", model["checkpoint"]).code == 0
+
+    evaluated = document("hjepa eval")
+    assert evaluated["horizon"] == list(range(101))
+    assert list(evaluated["methods"]) == list(load_settings().methods)
+    for entry in evaluated["methods"].values():
+        keys = "nmae nmae_ci95 score score_ci95 lq_ratio bits_per_transmission tolerance_p"
+        keys += " tolerance_gap_steps tolerance_gap_ci95 gap_curve delivery_curve"
+        assert entry.keys() >= set(keys.split())
+        assert len(entry["nmae"]) == 101
+
+    scaled = document("hjepa scale --snr 10:30")
+    assert scaled.keys() >= {"law", "bandwidth_hz", "slot_s", "rows", "limit_bits_per_s"}
+    assert {row["snr_db"] for row in scaled["rows"]} == {10, 15, 20, 25, 30}
+    for row in scaled["rows"]:
+        assert row.keys() >= {"snr_db", "method", "devices", "devices_ci95", "bits_per_s"}
+
+    finished = Path(encoder["checkpoint"]).parent
+    with shell.untouched():
+        assert document(f"hjepa train-encoder --out {finished}") == encoder
+
+
 def test_document_has_no_nan_even_from_numpy(shell, stage):
     import numpy as np
 

@@ -129,8 +129,8 @@ def test_numbers_align_right_and_texts_left():
 
 
 def test_bounds_and_intervals_count_as_numbers():
-    lines = layout(["D*"], [[">320"], ["9.5 [8, 11]"], ["-"]], 80)
-    assert lines == ["         D*", "-----------", "       >320", "9.5 [8, 11]", "          -"]
+    lines = layout(["D*"], [["> 320"], ["9.5 [8, 11]"], ["-"]], 80)
+    assert lines == ["         D*", "-----------", "      > 320", "9.5 [8, 11]", "          -"]
 
 
 def test_a_long_title_wraps(streams, monkeypatch):
@@ -144,6 +144,7 @@ def test_long_texts_fold_but_numbers_do_not():
     lines = layout(["path", "bytes"], [[path, "123456789"]], 40)
     assert max(map(len, lines)) <= 40
     assert "".join(line.split()[0] for line in lines[2:]) == path
+    assert max(map(len, lines)) == 40, "no more than needed"
     assert any(line.endswith("123456789") for line in lines)
 
 

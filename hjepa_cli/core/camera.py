@@ -39,6 +39,7 @@ POLE_RGB = (160, 0, 0)
 _CHUNK = 32  # frames drawn together: few calls, and the work stays in the cache
 _SUBPIXELS = 2.0**20
 _UPRIGHT_PX = 2.0**-17  # an edge that leans less inside a pixel row is spread over this much
+_LEVEL_PX = 1e-12  # an edge that rises less bounds no area
 _PIXEL = np.dtype("V3")  # one RGB pixel, copied as a whole
 
 # The pole's corners in order around it: the side of its axis, and the end (pivot 0, tip 1).
@@ -206,7 +207,8 @@ class _Pole:
         """
         a0, b0 = self.a[:, :, None], self.b[:, :, None]
         a1, b1 = np.roll(self.a, -1, axis=1)[:, :, None], np.roll(self.b, -1, axis=1)[:, :, None]
-        lean = (b1 - b0) / np.where(a1 == a0, 1.0, a1 - a0)
+        rise = a1 - a0
+        lean = (b1 - b0) / np.where(np.abs(rise) < _LEVEL_PX, np.inf, rise)
         first, last = np.minimum(a0, a1), np.maximum(a0, a1)
         start = np.minimum(np.maximum(np.asarray(a_low)[:, None], first), last)
         stop = np.minimum(np.maximum(np.asarray(a_high)[:, None], first), last)
@@ -215,7 +217,7 @@ class _Pole:
         flat = np.abs(b_stop - b_start) < _UPRIGHT_PX
         b_start = np.where(flat, centre - _UPRIGHT_PX / 2, b_start)
         b_stop = np.where(flat, centre + _UPRIGHT_PX / 2, b_stop)
-        weight = np.sign(a1 - a0) * (stop - start) / (b_stop - b_start) / 2
+        weight = np.sign(rise) * (stop - start) / (b_stop - b_start) / 2
 
         bounds = np.asarray(b_bounds, float)
         total = np.zeros(bounds.shape)

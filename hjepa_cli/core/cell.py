@@ -45,19 +45,15 @@ class Need:
     def under(cls, law: Law, method: str, entry: Mapping[str, Any]) -> "Need":
         """Read a method's entry of ``eval --json``."""
         key, kind = ("tolerance_gap_steps", "gap") if law == "duty" else ("tolerance_p", "p")
-        tolerance, interval = entry[key], entry[f"tolerance_{kind}_ci95"]
-        packets_per_slot = None
-        if tolerance:
-            packets_per_slot = 1 / tolerance if law == "duty" else tolerance
+        tolerance, ends = entry[key], entry[f"tolerance_{kind}_ci95"]
+        ordered = None if ends is None else sorted(ends, reverse=law == "equal")
         return cls(
-            method,
-            tolerance,
-            None
-            if interval is None
-            else (min(interval), max(interval))[:: 1 if law == "duty" else -1],
-            bool(entry[f"tolerance_{kind}_censored"]),
-            entry["bits_per_transmission"],
-            packets_per_slot,
+            method=method,
+            tolerance=tolerance,
+            interval=None if ordered is None else (ordered[0], ordered[1]),
+            at_least=bool(entry[f"tolerance_{kind}_censored"]),
+            payload_bits=entry["bits_per_transmission"],
+            packets_per_slot=(1 / tolerance if law == "duty" else tolerance) if tolerance else None,
         )
 
 

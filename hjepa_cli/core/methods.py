@@ -8,8 +8,9 @@ and dequantised. Methods on the true state are anchors: what prediction could ga
 import dataclasses
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
 SENSOR_BATCH = 256  # frame pairs rendered and encoded at a time: 12 MiB
+SMALL_BATCH = 16  # not worth a second thread
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,11 +102,12 @@ def true_state(previous: Floats, states: Floats) -> Floats:
 def embedding_sensor(model: "Model", bits_per_value: int) -> Callable[[Floats, Floats], Tensor]:
     """Sensor: render the last two frames, encode, quantise, dequantise.
 
-    Devices are shared out to one thread per core; each renders and encodes its own.
+    Devices are shared out to one thread per core, which renders and encodes them; see
+    :func:`one_core_per_thread`.
     """
     camera = Camera(plant(model.plant_name))
     workers = os.cpu_count() or 1
-    pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ThreadPoolExecutor(workers)
 
     def sense_some(pair: Floats) -> Tensor:
         frames = camera.render(pair.reshape(-1, 4))
@@ -114,11 +117,27 @@ def embedding_sensor(model: "Model", bits_per_value: int) -> Callable[[Floats, F
     def sense(previous: Floats, states: Floats) -> Tensor:
         """States [m, 4] one step before and now → received embeddings [m, D]."""
         pairs = np.stack([previous, states], axis=1)
-        size = min(SENSOR_BATCH, -(-len(pairs) // workers))
+        size = min(max(-(-len(pairs) // workers), SMALL_BATCH), SENSOR_BATCH)
         parts = [pairs[start : start + size] for start in range(0, len(pairs), size)]
-        return torch.cat(list(pool.map(sense_some, parts))).to(model.device)
+        received = pool.map(sense_some, parts) if len(parts) > 1 else map(sense_some, parts)
+        return torch.cat(list(received)).to(model.device)
 
     return sense
+
+
+@contextmanager
+def one_core_per_thread() -> Iterator[None]:
+    """Let PyTorch use one core per calling thread: the sensor's threads fill the others.
+
+    Many small batches side by side need no synchronisation inside each, which on a machine that
+    also does other work is several times faster.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _advance(kind: Plant, states: Floats, forces_n: Floats) -> Floats:

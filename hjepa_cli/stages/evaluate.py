@@ -14,7 +14,13 @@ from typing import Any
 from hjepa_cli.checks import check_methods
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.loop import Floats
-from hjepa_cli.core.methods import TRUE_STATE, Method, embedding_method, true_state_method
+from hjepa_cli.core.methods import (
+    TRUE_STATE,
+    Method,
+    embedding_method,
+    one_core_per_thread,
+    true_state_method,
+)
 from hjepa_cli.core.metrics import WINDOWS
 from hjepa_cli.core.model import Model
 from hjepa_cli.core.payload import payload_bits
@@ -372,7 +378,7 @@ def _is_run(directory: Path) -> bool:
 @contextmanager
 def _ticking(screen: Screen, label: str, steps: int) -> Iterator[Advance]:
     """A progress bar over control steps whose number is a guess: it neither overruns nor stops."""
-    with screen.progress(label, steps, "steps") as bar:
+    with one_core_per_thread(), screen.progress(label, steps, "steps") as bar:
         counter = _Counter(bar, steps)
         yield counter
         counter.advance(steps)
