@@ -339,7 +339,7 @@ def evaluate(
     plant_spread: options.PlantSpread = None,
     remeasure: options.Remeasure = False,
     checkpoint: options.Checkpoint = None,
-    dataset: options.Dataset = None,
+    dataset: options.CleanDataset = None,
     out: options.Out = None,
     preset: options.Preset = None,
     config: options.Config = None,
@@ -393,7 +393,7 @@ def scale(
     remeasure: options.Remeasure = False,
     verify: options.Verify = False,
     checkpoint: options.Checkpoint = None,
-    dataset: options.Dataset = None,
+    dataset: options.CleanDataset = None,
     out: options.Out = None,
     preset: options.Preset = None,
     config: options.Config = None,
@@ -445,7 +445,7 @@ def scale(
         screen,
         stage,
         lambda: plan.plan_scale(
-            settings, checkpoint, out, snr_db, remeasure=remeasure, verify=verify
+            settings, checkpoint, dataset, out, snr_db, remeasure=remeasure, verify=verify
         ),
         dry_run=dry_run,
     )

@@ -95,6 +95,15 @@ Dataset = Annotated[
     Path | None,
     _plain(FILES, "--dataset", "Dataset to read. Without it: the newest in data/.", metavar="DIR"),
 ]
+CleanDataset = Annotated[
+    Path | None,
+    _plain(
+        FILES,
+        "--dataset",
+        "Dataset whose clean rollouts to predict. Without it: simulated again from the seed.",
+        metavar="DIR",
+    ),
+]
 Encoder = Annotated[
     str | None,
     _plain(

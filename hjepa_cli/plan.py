@@ -162,6 +162,7 @@ def plan_eval(
 def plan_scale(
     settings: Settings,
     checkpoint: str | None,
+    dataset: Path | None,
     out: Path | None,
     snr_db: list[float],
     *,
@@ -181,7 +182,7 @@ def plan_scale(
         work.append("simulate one block at 0.9 and 1.1 of each tolerance")
     return Plan(
         command="scale",
-        reads=[_model(checkpoint, settings)],
+        reads=[_model(checkpoint, settings), _clean(dataset, settings)],
         work=work,
         writes=[f"run {_run('scale', out)} with the table (CSV) and the figure (PNG, SVG)"],
         writes_bytes=300_000,
@@ -251,7 +252,7 @@ def _dataset(path: Path | None, settings: Settings) -> str:
 
 
 def _clean(path: Path | None, settings: Settings) -> str:
-    return _dataset(path, settings) if path else "the clean rollouts of the newest dataset, if any"
+    return _dataset(path, settings) if path else "no dataset: clean rollouts come from the seed"
 
 
 def _encoder(name: str | None, settings: Settings) -> str:
@@ -261,7 +262,7 @@ def _encoder(name: str | None, settings: Settings) -> str:
 
 def _model(name: str | None, settings: Settings) -> str:
     found = _named(name) or _newest_run("train-hierarchy", settings)
-    return f"model {found}" if found else "model of the zoo"
+    return f"model {found}" if found else "model of the zoo, if it has one"
 
 
 def _named(name: str | None) -> Path | None:

@@ -181,5 +181,5 @@ def test_manifest_is_plain_data_that_fixes_the_picture():
 
 
 def test_an_unknown_plant_names_the_choices():
-    with pytest.raises(UsageError, match="moon.*desktop, gym"):
+    with pytest.raises(UsageError, match=r"moon.*desktop, gym"):
         Camera("moon")

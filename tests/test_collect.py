@@ -89,9 +89,10 @@ def test_a_trajectory_depends_on_its_seed_split_and_index_only():
         np.testing.assert_array_equal(values, many.tensors()[name][:2])
     short = generate(settings_of(trajectories=2, steps=30), "train")
     np.testing.assert_array_equal(short.states, few.states[:, :31])
+    streams = ((0, "train", 0), (0, "train", 1), (0, "test", 0), (1, "train", 0))
     starts = [
         generate(settings_of(seed=seed), split).states[index, 0, 0]
-        for seed, split, index in ((0, "train", 0), (0, "train", 1), (0, "test", 0), (1, "train", 0))
+        for seed, split, index in streams
     ]
     assert len(set(starts)) == 4
 
@@ -178,9 +179,7 @@ def test_the_training_phase_s_uplink_is_told(tmp_path):
         ({"theta_rad": -0.1}, "theta_rad"),
     ],
 )
-def test_impossible_settings_are_refused_before_anything_is_written(
-    tmp_path, screen, change, name
-):
+def test_impossible_settings_are_refused_before_anything_is_written(tmp_path, screen, change, name):
     with pytest.raises(UsageError, match=name):
         collect.run(settings_of(**change), screen, out=tmp_path / "data")
     assert not (tmp_path / "data").exists()

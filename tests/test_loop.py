@@ -229,7 +229,9 @@ def test_a_packet_of_step_k_carries_frames_k_minus_1_and_k() -> None:
         poles.step(np.full(2, 0.1 * (k + 1)))
         poles.states = poles.states + draws.noise[k]
         trajectory[k + 1] = poles.states
-    sent_at = {device: [k for k, p in enumerate(recorder.packets) if device in p] for device in (0, 1)}
+    sent_at = {
+        device: [k for k, p in enumerate(recorder.packets) if device in p] for device in (0, 1)
+    }
     assert sent_at == {0: [0, 5, 10], 1: [0, 1, 6, 11]}
     for k, packets in enumerate(recorder.packets):
         for device, (previous, current) in packets.items():

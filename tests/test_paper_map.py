@@ -1,4 +1,4 @@
-"""docs/paper_map.md names functions and tests; they must exist."""
+"""The documents name functions, tests and files; they must exist."""
 
 import ast
 import re
@@ -8,6 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "paper_map.md").read_text(encoding="utf-8")
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PLACES = sorted(set(re.findall(r"`([a-z_/]+\.py)(?:::(\w+))?`", TEXT)))
 
 
@@ -26,3 +27,10 @@ def test_every_function_and_test_of_the_map_exists(file, name):
             targets = getattr(node, "targets", [getattr(node, "target", None)])
             defined |= {getattr(target, "id", None) for target in targets}
         assert name in defined
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_to_files(document):
+    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text(encoding="utf-8"))
+    for link in links:
+        assert (document.parent / link).exists(), link

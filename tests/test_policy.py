@@ -112,7 +112,7 @@ def test_the_teacher_is_made_once_per_plant():
 
 
 def test_an_unknown_plant_names_the_choices():
-    with pytest.raises(UsageError, match="moon.*desktop, gym"):
+    with pytest.raises(UsageError, match=r"moon.*desktop, gym"):
         teacher("moon")
 
 

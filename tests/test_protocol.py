@@ -29,7 +29,9 @@ class Fake:
     def measure(self, points: Sequence[Point], devices: int) -> Outcome:
         self.asked += [(point, devices) for point in points]
         bias = self.few_bias if devices == PROTOCOL.curve_devices else 0.0
-        scores = np.array([self.curve(point.gap) + bias + self.offsets[:devices] for point in points])
+        scores = np.array(
+            [self.curve(point.gap) + bias + self.offsets[:devices] for point in points]
+        )
         return Outcome(scores, 1 / np.maximum(scores, 1e-3))
 
     def curves(self, protocol: ProtocolSettings = PROTOCOL) -> Curves:
@@ -44,7 +46,9 @@ class Fake:
 
     def gaps_with_many(self, kind: str) -> list[float]:
         many = PROTOCOL.bracket_devices
-        return [point.gap for point, devices in self.asked if devices == many and point.kind == kind]
+        return [
+            point.gap for point, devices in self.asked if devices == many and point.kind == kind
+        ]
 
 
 def falling(tolerance: float, slope: float = 0.5) -> Curve:

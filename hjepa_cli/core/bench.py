@@ -13,9 +13,13 @@ from hjepa_cli.core.plant import Plant
 from hjepa_cli.core.protocol import KINDS, Curves, Point, Reference, measure_curves
 from hjepa_cli.settings import ProtocolSettings
 
-
 Tick = Callable[[], None]
 """Called after every simulated control step, for progress."""
+
+TOLERANCES = (
+    *("gap_steps", "gap_ci95", "gap_censored", "gap_lq_steps"),
+    *("p", "p_ci95", "p_censored", "p_lq"),
+)
 
 
 class Bench:
@@ -74,17 +78,13 @@ class Bench:
         if not method.uses_link:
             return _flat_entry(self.protocol)
         curves = self.curves(method)
-        described = {
-            kind: self.reference.describe(*curves.grid[kind]) for kind in KINDS
-        }
+        described = {kind: self.reference.describe(*curves.grid[kind]) for kind in KINDS}
         brackets = {
             kind: self.reference.describe(search.points, search.outcome)
             for kind, search in curves.searches.items()
         }
         gap, delivery = (curves.searches[kind].result() for kind in KINDS)
-        lq_gap, lq_delivery = (
-            self._lq_tolerance(kind, described[kind]) for kind in KINDS
-        )
+        lq_gap, lq_delivery = (self._lq_tolerance(kind, described[kind]) for kind in KINDS)
         return {
             "score": described["gap"][0]["score"],
             "score_ci95": described["gap"][0]["ci95"],
@@ -185,14 +185,12 @@ def _flat_entry(protocol: ProtocolSettings) -> dict[str, Any]:
         "lq_ratio": 1.0,
         "n_devices": protocol.curve_devices,
     }
-    tolerance = ("gap_steps", "gap_ci95", "gap_censored", "gap_lq_steps")
-    tolerance += ("p", "p_ci95", "p_censored", "p_lq")
     return {
         "score": 1.0,
         "score_ci95": [1.0, 1.0],
         "lq_ratio": 1.0,
         "bits_per_transmission": None,
-        **{f"tolerance_{name}": None for name in tolerance},
+        **{f"tolerance_{name}": None for name in TOLERANCES},
         **{
             f"{kind}_curve": [
                 {**Point(kind, float(gap)).coordinate(), **perfect} for gap in protocol.gaps

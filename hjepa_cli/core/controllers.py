@@ -59,7 +59,7 @@ class StrideController:
             self._phase[due] = 0
         played = self._forces_n.numpy()[np.arange(len(delivered)), self._phase]
         self._phase += 1
-        return played.astype(np.float64)
+        return np.asarray(played, dtype=np.float64)
 
 
 class LastForce:

@@ -1,4 +1,4 @@
-"""The target encoder: an exponential moving average of the context encoder (paper eq. 4)."""
+"""The target encoder: an exponential moving average of the context encoder (paper eq. 5)."""
 
 import copy
 

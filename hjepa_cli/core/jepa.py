@@ -14,7 +14,7 @@ from hjepa_cli.core.predictors import Predictor
 
 
 class Jepa:
-    """Ψ_θ and P^H trained together (paper eqs. 4-6), with an optional auxiliary task.
+    """Ψ_θ and P^H trained together (paper eqs. 5-7), with an optional auxiliary task.
 
     Args:
         encoder: the context encoder; the target starts as its copy.

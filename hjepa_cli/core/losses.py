@@ -8,7 +8,7 @@ from torch.nn import functional as F
 def cosine_loss(predicted: Tensor, target: Tensor) -> Tensor:
     """1 − cos(z̃, sg(z)), averaged over all leading axes; inputs [..., D].
 
-    The paper prints arg min of the cosine itself (eq. 6), a sign slip.
+    The paper prints arg min of the cosine itself (eq. 7), a sign slip.
     """
     return 1.0 - F.cosine_similarity(predicted, target.detach(), dim=-1).mean()
 

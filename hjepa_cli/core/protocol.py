@@ -24,6 +24,7 @@ KINDS = ("gap", "delivery")
 STEP_OUT = 4  # brackets that a search goes outwards at a time, to find the end of an interval
 MAX_GUESSES = 4  # points of a search placed by interpolation, before it bisects
 
+
 @dataclasses.dataclass(frozen=True)
 class Point:
     """One point of a curve: a link with mean gap ``gap`` between packets, in steps.
@@ -79,7 +80,7 @@ class Reference:
 
     def relative_cost(self, outcome: Outcome) -> Floats:
         """LQ ratio of each point [P]: J of the teacher ÷ J of the method."""
-        return self.cost[: outcome.cost.shape[1]].mean() / outcome.cost.mean(axis=1)
+        return np.asarray(self.cost[: outcome.cost.shape[1]].mean() / outcome.cost.mean(axis=1))
 
     def describe(self, points: Sequence[Point], outcome: Outcome) -> list[dict[str, Any]]:
         """Curve entries as printed: coordinate, score, its interval, LQ ratio, devices."""
@@ -136,7 +137,7 @@ class Search:
         protocol: ProtocolSettings,
     ) -> None:
         self.kind = kind
-        self._grid = {float(gap): float(score) for gap, score in zip(grid, grid_scores, strict=True)}
+        self._grid = dict(zip(map(float, grid), grid_scores.tolist(), strict=True))
         self._measured: dict[float, tuple[Floats, Floats]] = {}
         self._reference = reference
         self._level, self._bracket = protocol.acceptable_score, protocol.bracket

@@ -110,7 +110,7 @@ def film(
     camera: Camera, splits: dict[str, Trajectories], store: bool, screen: Screen
 ) -> tuple[dict[str, Trajectories], float]:
     """Render every split to be kept, else a sample to be dropped; also returns frames/s."""
-    filmed = splits if store else {"train": splits["train"][:SAMPLE_TRAJECTORIES]}
+    filmed = dict(splits) if store else {"train": splits["train"][:SAMPLE_TRAJECTORIES]}
     total = sum(split.states[..., 0].size for split in filmed.values())
     started = time.perf_counter()
     with screen.progress("render" if store else "render a sample", total, "frames") as bar:

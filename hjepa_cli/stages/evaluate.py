@@ -32,9 +32,10 @@ from hjepa_cli.screen import Advance, Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage import curves, runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
-from hjepa_cli.storage.curves import CURVES_FILE, Digest, Entry
+from hjepa_cli.storage.curves import Digest, Entry
 from hjepa_cli.storage.datasets import Dataset, load_dataset
 from hjepa_cli.storage.runs import Run
+from hjepa_cli.storage.zoo import CURVES_FILE
 
 MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods (spec §4)
 USUAL_SIMULATIONS = 8  # of one method, for its progress bar: the grid, then the bisection
@@ -360,8 +361,11 @@ def _source(found: dict[str, tuple[Entry, Path]]) -> str:
 
 def _how_to_train(method: str, subject: Subject) -> str:
     """The command that trains the model of a method."""
-    plant_flag = "" if subject.settings.preset == "default" else f" --preset {subject.settings.preset}"
-    train = f"hjepa train-hierarchy{plant_flag}"
+    train = "hjepa train-hierarchy"
+    if subject.settings.preset != "default":
+        train += f" --preset {subject.settings.preset}"
+    elif subject.settings.plant != "desktop":
+        train += f" --plant {subject.settings.plant}"
     if method.startswith("ts-jepa-") and subject.model is not None:
         h = int(method.removeprefix("ts-jepa-"))
         return f"{train} --h {h} --m {h // 2 if h % 2 == 0 else 1} --l 1"
@@ -398,9 +402,7 @@ def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
 
 
-def _tolerance(
-    entry: Entry, value_key: str, key: str, decimals: int, beyond: str
-) -> str | None:
+def _tolerance(entry: Entry, value_key: str, key: str, decimals: int, beyond: str) -> str | None:
     """``112.5 [104.1, 118.0]``; ``> 320`` where the score is acceptable to the grid's end."""
     value = entry[f"tolerance_{value_key}"]
     if value is None:

@@ -22,7 +22,7 @@ from hjepa_cli.core.metrics import window_means
 from hjepa_cli.core.model import Model, build_modules, encode_frames, load_modules, tensors_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
-from hjepa_cli.core.training import Optimiser, fit_actor, resolve_device
+from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
@@ -193,6 +193,7 @@ def train_levels(
         plain.first(options.fine_trajectories), mirrored.first(options.fine_trajectories)
     )
     stream = generator(settings.seed, STREAM)
+    device = resolve_device(settings.device)
     high, medium, low, flat = (modules[name] for name in ("high", "medium", "low", "flat"))
     common = {
         "horizon_steps": options.rollout_steps,
@@ -214,7 +215,8 @@ def train_levels(
         modules[name].train()
         with screen.progress(f"train {name}", steps, "steps") as bar:
             for step in range(steps):
-                value = loss()
+                with autocast(device, settings.encoder.precision):
+                    value = loss()
                 optimiser.step(value, step)
                 bar.advance(1, loss=value.item())
                 if (step + 1) % REPORT_EVERY == 0 or step + 1 == steps:

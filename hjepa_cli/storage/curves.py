@@ -17,9 +17,9 @@ from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage import files
 from hjepa_cli.storage.runs import ROOT
+from hjepa_cli.storage.zoo import CURVES_FILE
 
 SCHEMA = 1
-CURVES_FILE = "curves.json"
 
 Entry = dict[str, Any]
 

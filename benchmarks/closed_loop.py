@@ -1,0 +1,153 @@
+"""Speed of the closed loop: plant, camera, encoder, planners, and how much faster than real time.
+
+    python benchmarks/closed_loop.py [--checkpoint NAME|PATH] [--devices 64] [--steps 200]
+
+Without a checkpoint the newest run or the zoo's model is taken, and failing both an untrained
+model of the default architecture, which is just as fast. A real-time factor of 10 means that all
+devices together are simulated, seen, encoded and controlled ten times faster than they move.
+"""
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from hjepa_cli.core.bench import Bench
+from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.methods import (
+    TRUE_STATE,
+    embedding_method,
+    one_core_per_thread,
+    true_state_method,
+)
+from hjepa_cli.core.model import Model, build_modules
+from hjepa_cli.core.plant import CartPoles, plant
+from hjepa_cli.core.protocol import Point
+from hjepa_cli.errors import HjepaError
+from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.stages.train_encoder import describe_architecture
+from hjepa_cli.storage import runs, zoo
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--checkpoint", help="zoo name, run directory or file")
+    parser.add_argument("--devices", type=int, default=64)
+    parser.add_argument("--steps", type=int, default=200)
+    options = parser.parse_args()
+    settings = load_settings()
+    model = open_model(options.checkpoint, settings)
+    print(f"{torch.get_num_threads()} threads, model on {model.device}, plant {model.plant_name}")
+    pieces(model, options.devices)
+    loops(model, settings, options.devices, options.steps)
+
+
+def pieces(model: Model, devices: int) -> None:
+    """Each part of a control step on its own."""
+    kind = plant(model.plant_name)
+    states = np.random.default_rng(0).normal(size=(2 * devices, 4)) * 0.05
+    poles = CartPoles(kind, devices)
+    print(f"plant     {devices / seconds(lambda: poles.step(np.zeros(devices))):12,.0f} steps/s")
+    camera = Camera(kind)
+    print(f"camera    {2 * devices / seconds(lambda: camera.render(states)):12,.0f} frames/s")
+    for count in (1, devices, 256):
+        frames = np.random.default_rng(0).integers(0, 256, (count, 2, 64, 128, 3), np.uint8)
+        each_ms = 1e3 * seconds(lambda frames=frames: model.encode(frames)) / count
+        print(f"encoder   {each_ms:12.3f} ms per embedding in batches of {count}")
+    macs = multiply_accumulates(lambda: model.encode(frames[:1]))
+    print(f"encoder   {macs / 1e6:12.1f} million MACs per embedding")
+    z = torch.randn(devices, model.architecture["embedding"], device=model.device)
+    for name in (method for method in model.methods if method not in ("hold", "zero")):
+        planner = model.planner(name)
+        with torch.inference_mode():
+            took_ms = 1e3 * seconds(lambda planner=planner: planner.plan(z))
+            macs = multiply_accumulates(lambda planner=planner: planner.plan(z[:1]))
+        print(
+            f"{name:9} {took_ms / devices / planner.stride:12.4f} ms, "
+            f"{macs / planner.stride / 1e6:.2f} million MACs per device and control step"
+        )
+
+
+def loops(model: Model, settings: Settings, devices: int, steps: int) -> None:
+    """The whole loop at a few gaps, as ``eval`` runs it."""
+    kind = plant(model.plant_name)
+    protocol = dataclasses.replace(
+        settings.protocol, steps=steps, curve_devices=devices, bracket_devices=devices
+    )
+    bench = Bench(kind, protocol, 0)
+    print(
+        f"real-time factor of {devices} devices together, {steps} steps of {kind.step_s * 1e3:g} ms"
+    )
+    for name in (*model.methods, *(method for method in TRUE_STATE if method != "optimal")):
+        if name in TRUE_STATE:
+            method = true_state_method(name, kind, 0)
+        else:
+            method = embedding_method(name, model, protocol.payload_bits_per_value)
+        factors = []
+        for gap in (1.0, 20.0, 80.0):
+            started = time.perf_counter()
+            with one_core_per_thread():
+                bench.measure(method, [Point("gap", gap)], devices)
+            took_s = time.perf_counter() - started
+            factors.append(f"{devices * steps * kind.step_s / took_s:9.1f} x at D = {gap:g}")
+        print(f"{name:9} " + ", ".join(factors))
+
+
+def open_model(name: str | None, settings: Settings) -> Model:
+    """The model asked for, the newest run's, the zoo's, or an untrained one."""
+    path: Path | None = zoo.resolve_model(name) if name else None
+    if path is None:
+        try:
+            path = runs.newest_run("train-hierarchy")
+            path = zoo.resolve_model(path or zoo.list_models()[0])
+        except (HjepaError, IndexError):
+            return untrained(settings)
+    return Model.load(path, settings.device)
+
+
+def untrained(settings: Settings) -> Model:
+    """Random networks of the default architecture."""
+    strides = settings.hierarchy
+    architecture = describe_architecture(settings) | {
+        "kind": "hierarchy",
+        "h": strides.h,
+        "m": strides.m,
+        "l": strides.l,
+        "actor_hidden": settings.actor.hidden,
+        "actor_dropout": settings.actor.dropout,
+    }
+    metadata = {
+        "architecture": architecture,
+        "plant": settings.plant,
+        "settings": settings.as_dict(),
+    }
+    print("untrained model")
+    return Model(build_modules(architecture), metadata, "untrained", settings.device)
+
+
+def seconds(work: Callable[[], object], at_least_s: float = 1.0) -> float:
+    """Best time of one call, over calls that together take ``at_least_s``."""
+    work()
+    best, spent = np.inf, 0.0
+    while spent < at_least_s:
+        started = time.perf_counter()
+        work()
+        took = time.perf_counter() - started
+        best, spent = min(best, took), spent + took
+    return float(best)
+
+
+def multiply_accumulates(work: Callable[[], object]) -> float:
+    """MACs of one call: PyTorch counts two operations for each."""
+    with FlopCounterMode(display=False) as counter:
+        work()
+    return counter.get_total_flops() / 2
+
+
+if __name__ == "__main__":
+    main()
