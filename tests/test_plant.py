@@ -168,9 +168,7 @@ def test_a_state_that_is_set_is_read_back_and_the_joint_accepts_it(name):
     kind, devices = PLANTS[name], 100
     states = generator(4).uniform(-1, 1, (devices, 4)) * [50, 2, 50, 10]
     poles = CartPoles(kind, devices)
-    poles.step(
-        np.full(devices, 3.0)
-    )  # leaves impulses behind that must not leak into the new state
+    poles.step(np.full(devices, 3.0))  # leaves impulses behind that must not leak over
     poles.states = states
     np.testing.assert_allclose(poles.states, states, rtol=0, atol=1e-13)
     poles.step(np.zeros(devices))

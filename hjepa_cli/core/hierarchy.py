@@ -12,9 +12,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from hjepa_cli.checks import check_strides
 from hjepa_cli.core.losses import cosine_loss
 from hjepa_cli.core.predictors import Predictor
-from hjepa_cli.errors import UsageError
 
 
 class Step(Protocol):
@@ -38,18 +38,7 @@ class Strides:
     l: int
 
     def __post_init__(self) -> None:
-        if self.h < 1:
-            raise UsageError(f"--h {self.h}: strides are positive whole numbers")
-        for name, value, outer_name, outer in (
-            ("m", self.m, "h", self.h),
-            ("l", self.l, "m", self.m),
-        ):
-            if value < 1 or outer % value:
-                valid = ", ".join(str(d) for d in range(1, outer + 1) if outer % d == 0)
-                raise UsageError(
-                    f"--{name} {value} does not divide --{outer_name} {outer}; "
-                    f"choose --{name} from {valid}"
-                )
+        check_strides(self.h, self.m, self.l)
 
 
 def rollout_loss(

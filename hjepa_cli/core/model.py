@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hjepa_cli.core.actor import Actor
+from hjepa_cli.core.controllers import Planner
 from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.hierarchy import Strides, build_predictors, hold, plan_stride
 from hjepa_cli.core.plant import plant
@@ -18,16 +19,6 @@ from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
 
 ENCODE_BATCH = 250
-
-
-class Planner(Protocol):
-    """Turns embeddings into one stride of forces and the embedding the next stride starts from."""
-
-    stride: int
-
-    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Embeddings [N, D] → forces_n [N, stride], next embeddings [N, D]."""
-        ...
 
 
 def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
@@ -115,6 +106,11 @@ class Model:
         self.strides = Strides(*(self.architecture[name] for name in ("h", "m", "l")))
         self.device = resolve_device(device)
         self.modules = modules.to(self.device).eval()
+        self._planners: dict[str, Planner] = {
+            "hjepa": _Hierarchical(self),
+            f"ts-jepa-{self.strides.h}": _Flat(self, "high", self.strides.h),
+            "ts-jepa-1": _Flat(self, "flat", 1),
+        }
 
     @classmethod
     def load(cls, path: Path, device: str = "auto") -> "Model":
@@ -130,10 +126,8 @@ class Model:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The methods this model can plan; P^H alone is TS-JEPA of depth h."""
-        return tuple(
-            dict.fromkeys(("hjepa", "ts-jepa-1", f"ts-jepa-{self.strides.h}", "hold", "zero"))
-        )
+        """What this model can drive; P^H alone is TS-JEPA of depth h."""
+        return (*self._planners, "hold", "zero")
 
     def encode(self, frames: NDArray[np.uint8]) -> Tensor:
         """Frames uint8 [N, 2, 64, 128, 3] (previous, current) → embeddings float32 [N, D]."""
@@ -149,22 +143,16 @@ class Model:
         return self.force_limit_n * self._act(z)
 
     def planner(self, method: str) -> Planner:
-        """The planner behind ``method``, one of :attr:`methods`.
+        """The planner behind ``method``.
 
         Raises:
-            UsageError: this model does not hold the method.
+            UsageError: this model does not predict with that method.
         """
-        if method not in self.methods:
+        if method not in self._planners:
             raise UsageError(
-                f"this model has no method '{method}'; choose from {', '.join(self.methods)}"
+                f"this model has no planner '{method}'; choose from {', '.join(self._planners)}"
             )
-        if method == "hjepa":
-            return _Hierarchical(self)
-        if method == "ts-jepa-1":
-            return _Flat(self, "flat", 1)
-        if method in ("hold", "zero"):
-            return _Repeat(self, keep=method == "hold")
-        return _Flat(self, "high", self.strides.h)
+        return self._planners[method]
 
     def _act(self, z: Tensor) -> Tensor:
         return self.modules["actor"].act(z)  # type: ignore[no-any-return, operator]
@@ -200,19 +188,3 @@ class _Flat:
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
         actions = hold(self._model._act(z), self.stride)
         return self._model.force_limit_n * actions, self._predictor(z, actions)
-
-
-class _Repeat:
-    """No prediction: keep the last force until the next packet, or apply none after one step."""
-
-    def __init__(self, model: Model, *, keep: bool) -> None:
-        self._model, self.stride, self._keep = model, 1, keep
-        self._silent = torch.zeros(model.architecture["embedding"])
-
-    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        forces = hold(self._model.actor(z), 1)
-        if self._keep:
-            return forces, z
-        # The zero embedding marks "no packet since": encoded embeddings have length √D, never 0.
-        silent = (z == self._silent).all(dim=-1, keepdim=True)
-        return torch.where(silent, torch.zeros_like(forces), forces), self._silent.expand_as(z)

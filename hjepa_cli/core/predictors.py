@@ -1,7 +1,7 @@
 """One predictor P: an embedding and the actions of its stride in, the embedding a stride later out.
 
-The same network serves all levels (paper eqs. 6, 8, 9): P^H sees z and the stride's actions; P^M and
-P^L also see the coarser prediction they interpolate towards.
+The same network serves all levels (paper eqs. 6, 8, 9): P^H sees z and the stride's actions; P^M
+and P^L also see the coarser prediction they interpolate towards.
 """
 
 import torch

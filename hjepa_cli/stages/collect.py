@@ -28,7 +28,7 @@ from hjepa_cli.storage.datasets import (
 )
 
 FRAMES_PER_SAMPLE = 2  # κ: current and previous
-SAMPLE_TRAJECTORIES = 20  # rendered to measure the camera when frames are not stored
+TOGETHER = 20  # trajectories rendered at a time; the sample is one such batch
 
 
 def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[str, Any]:
@@ -110,17 +110,22 @@ def film(
     camera: Camera, splits: dict[str, Trajectories], store: bool, screen: Screen
 ) -> tuple[dict[str, Trajectories], float]:
     """Render every split to be kept, else a sample to be dropped; also returns frames/s."""
-    filmed = dict(splits) if store else {"train": splits["train"][:SAMPLE_TRAJECTORIES]}
+    filmed = splits if store else {"train": splits["train"][:TOGETHER]}
     total = sum(split.states[..., 0].size for split in filmed.values())
+    kept = {}
     started = time.perf_counter()
     with screen.progress("render" if store else "render a sample", total, "frames") as bar:
         for name, split in filmed.items():
-            frames = np.empty((*split.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3), np.uint8)
-            for trajectory, states in zip(frames, split.states, strict=True):
-                trajectory[:] = camera.render(states)
-                bar.advance(len(states))
-            filmed[name] = dataclasses.replace(split, frames=frames)
-    return (filmed if store else splits), total / (time.perf_counter() - started)
+            shape = (*split.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
+            frames = np.empty(shape, np.uint8) if store else None
+            for start in range(0, len(split), TOGETHER):
+                states = split.states[start : start + TOGETHER]
+                images = camera.render(states.reshape(-1, 4))
+                if frames is not None:
+                    frames[start : start + TOGETHER] = images.reshape(-1, *shape[1:])
+                bar.advance(len(images))
+            kept[name] = dataclasses.replace(split, frames=frames)
+    return (kept if store else splits), total / (time.perf_counter() - started)
 
 
 def describe(data: Dataset, seconds: float, frames_per_s: float | None) -> dict[str, Any]:

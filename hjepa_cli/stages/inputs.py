@@ -11,10 +11,15 @@ from torch import Tensor
 from hjepa_cli import __version__
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.plant import plant
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
-from hjepa_cli.storage.datasets import Dataset, find_newest_dataset, load_dataset
+from hjepa_cli.storage.datasets import (
+    Dataset,
+    Trajectories,
+    find_newest_dataset,
+    load_dataset,
+)
 
 RENDER_CHUNK = 20  # trajectories per call, so that progress shows
 
@@ -71,25 +76,18 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
             f"no dataset of plant {settings.plant} below data/",
             hint=f"hjepa collect --plant {settings.plant}, or pass --dataset DIR",
         )
-    data = load_dataset(path)
-    if data.plant != settings.plant:
-        raise DataError(
-            f"dataset {data.path} is of plant {data.plant}, not {settings.plant}",
-            hint=f"add --plant {data.plant} or --preset {data.plant}, or pass another --dataset",
-        )
-    return data
+    return load_dataset(path, settings.plant)
 
 
-def render(data: Dataset, split: str, screen: Screen) -> RenderedSplit:
+def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> RenderedSplit:
     """Frames of one split, rendered now unless the dataset stores them."""
-    trajectories = data.split(split)
-    limit_n = plant(data.plant).force_limit_n
+    limit_n = plant(plant_name).force_limit_n
     frames = trajectories.frames
     if frames is None:
-        camera = Camera(plant(data.plant))
-        count = len(trajectories.states)
+        camera = Camera(plant_name)
+        count = len(trajectories)
         parts = []
-        with screen.progress(f"render {split}", count, "trajectories") as bar:
+        with screen.progress("render", count, "trajectories") as bar:
             for start in range(0, count, RENDER_CHUNK):
                 chunk = trajectories.states[start : start + RENDER_CHUNK]
                 images = camera.render(chunk.reshape(-1, 4))

@@ -42,14 +42,18 @@ def run(
         NumericalError: training diverged, or a gate failed (see ``settings.encoder.gate``).
     """
     data = open_dataset(dataset, settings)
+    recorded = {split: data.split(split) for split in ("train", "test")}
     with Run.create("train-encoder", out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
             return record.result
+        if record.resumed:
+            screen.say("this run was interrupted; it starts again from the same seed")
+            record.keep_metrics(0)
         started = time.perf_counter()
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path} ({settings.plant}), run {record.directory}")
-        train, test = (render(data, split, screen) for split in ("train", "test"))
+        train, test = (render(split, settings.plant, screen) for split in recorded.values())
         architecture = describe_architecture(settings)
         modules = build_modules(architecture)
         encoder, companion = modules["encoder"], modules["high"]

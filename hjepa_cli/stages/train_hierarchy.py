@@ -54,11 +54,15 @@ def run(
     """
     strides = Strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
     data = open_dataset(dataset, settings)
+    recorded = data.split("train")
     source = open_encoder(encoder, settings)
     with Run.create("train-hierarchy", out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
             return record.result
+        if record.resumed:
+            screen.say("this run was interrupted; it starts again from the same seed")
+            record.keep_metrics(0)
         started = time.perf_counter()
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path}, encoder {source.path}, run {record.directory}")
@@ -67,7 +71,7 @@ def run(
         copy_encoder(source, modules, strides)
         modules.to(resolve_device(settings.device))
 
-        train = render(data, "train", screen)
+        train = render(recorded, settings.plant, screen)
         plain, mirrored = embed(modules["encoder"], train, settings, screen)
         labels = train.labels.flatten()
         screen.say("fitting the semantic actor")
