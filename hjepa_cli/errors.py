@@ -28,7 +28,7 @@ class UsageError(HjepaError):
 
 
 class DataError(HjepaError):
-    """A file exists but does not hold what it should (foreign, truncated, tampered, other plant)."""
+    """A file does not hold what it should (foreign, truncated, tampered, other plant)."""
 
     exit_code = 65
 

@@ -18,9 +18,9 @@ ENCODER_PARAMETERS = 1_500_000
 RATES_PER_S = {  # two cores of a server CPU
     "simulated steps": 400_000.0,
     "rendered frames": 6_000.0,
-    "encoder training frames": 1_000.0,
+    "encoder training frames": 450.0,
     "encoded frames": 3_000.0,
-    "level training steps": 20.0,
+    "level training steps": 8.0,
     "closed-loop frames": 2_000.0,
 }
 STATE_METHODS = ("hold-true", "zero-true", "optimal", "oracle")  # these render and encode nothing
@@ -117,7 +117,7 @@ def plan_train_hierarchy(
     """Plan of ``hjepa train-hierarchy``."""
     options = settings.hierarchy
     frames = _frames(settings)
-    steps = 2 * options.coarse_steps + options.medium_steps + options.low_steps
+    steps = options.coarse_steps + options.flat_steps + options.medium_steps + options.low_steps
     parameters = ENCODER_PARAMETERS + 4 * _predictor(settings, options.h)
     return Plan(
         command="train-hierarchy",

@@ -104,6 +104,7 @@ class HierarchySettings:
     coarse_steps: int
     coarse_learning_rate: float
     coarse_weight_decay: float
+    flat_steps: int
     medium_steps: int
     medium_learning_rate: float
     medium_weight_decay: float

@@ -540,6 +540,7 @@ steps = 2
 epochs = 1
 [hierarchy]
 coarse_steps = 2
+flat_steps = 2
 medium_steps = 2
 low_steps = 2
 [protocol]

@@ -205,8 +205,7 @@ def train_levels(
         "generator": stream,
     }
 
-    def fit(name: str, role: str, loss: Callable[[], Tensor]) -> None:
-        steps = getattr(options, f"{role}_steps")
+    def fit(name: str, role: str, steps: int, loss: Callable[[], Tensor]) -> None:
         optimiser = Optimiser(
             modules[name].parameters(),
             name=options.optimizer,
@@ -227,20 +226,24 @@ def train_levels(
                     record.metric({"level": name, "step": step + 1, "loss": value.item()})
         modules[name].eval()
 
-    fit(
-        "high",
-        "coarse",
-        lambda: levels.flat_loss(high, coarse_data, h, starts=options.coarse_starts, **common),
-    )
+    def high_loss() -> Tensor:
+        return levels.flat_loss(high, coarse_data, h, starts=options.coarse_starts, **common)
+
+    def medium_loss() -> Tensor:
+        return levels.medium_loss(medium, high, fine_data, h, m, **common)
+
+    def low_loss() -> Tensor:
+        return levels.low_loss(low, medium, high, fine_data, h, m, l, **common)
+
+    def flat_loss() -> Tensor:
+        return levels.flat_loss(flat, coarse_data, 1, starts=options.flat_starts, **common)
+
+    fit("high", "coarse", options.coarse_steps, high_loss)
     if h > m:
-        fit("medium", "medium", lambda: levels.medium_loss(medium, high, fine_data, h, m, **common))
+        fit("medium", "medium", options.medium_steps, medium_loss)
     if m > l:
-        fit("low", "low", lambda: levels.low_loss(low, medium, high, fine_data, h, m, l, **common))
-    fit(
-        "flat",
-        "coarse",
-        lambda: levels.flat_loss(flat, coarse_data, 1, starts=options.flat_starts, **common),
-    )
+        fit("low", "low", options.low_steps, low_loss)
+    fit("flat", "coarse", options.flat_steps, flat_loss)
 
 
 def join(plain: EmbeddedTrajectories, mirrored: EmbeddedTrajectories) -> EmbeddedTrajectories:
