@@ -186,9 +186,8 @@ def main() -> None:
     for name, values in speeds.items():
         median = statistics.median(values)
         ratio = statistics.median(o / v for o, v in zip(speeds["hjepa"], values, strict=True))
-        print(
-            f"{name:8s} {median:9.0f} [{min(values):.0f}, {max(values):.0f}]  hjepa ÷ it: {ratio:.2f}"
-        )
+        spread = f"[{min(values):.0f}, {max(values):.0f}]"
+        print(f"{name:8s} {median:9.0f} {spread:18s} hjepa ÷ it: {ratio:.2f}")
 
 
 if __name__ == "__main__":
