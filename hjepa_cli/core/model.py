@@ -56,7 +56,8 @@ def load_modules(checkpoint: Checkpoint, kind: str) -> nn.ModuleDict:
     if architecture["kind"] != kind:
         stage = {"encoder": "train-encoder", "hierarchy": "train-hierarchy"}
         raise DataError(
-            f"{checkpoint.path} holds a {architecture['kind']} checkpoint, not a {kind} checkpoint",
+            f"{checkpoint.path} is a checkpoint of {stage[architecture['kind']]}, "
+            f"not of {stage[kind]}",
             hint=f"hjepa {stage[kind]}",
         )
     modules = build_modules(architecture)

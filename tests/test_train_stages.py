@@ -1,0 +1,165 @@
+"""Both training stages on a handful of trajectories: what they save, refuse and repeat."""
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hjepa_cli.core.model import Model, load_modules
+from hjepa_cli.errors import DataError, NumericalError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.stages import collect, train_encoder, train_hierarchy
+from hjepa_cli.storage.checkpoints import load_checkpoint
+
+QUIET = Screen(quiet=True)
+TINY = {
+    "collect.trajectories": 6,
+    "collect.test_trajectories": 4,
+    "collect.clean_trajectories": 2,
+    "encoder.steps": 4,
+    "encoder.batch_trajectories": 6,  # 4 steps are one epoch: one row of metrics
+    "encoder.gate": False,
+    "actor.epochs": 1,
+    "hierarchy.rollout_steps": 8,
+    "hierarchy.batch_trajectories": 2,
+    "hierarchy.coarse_steps": 2,
+    "hierarchy.flat_steps": 2,
+    "hierarchy.medium_steps": 2,
+    "hierarchy.low_steps": 2,
+}
+
+
+def settings(**changes: object) -> Settings:
+    return load_settings(flags=TINY | {key.replace("__", "."): v for key, v in changes.items()})
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset and an encoder, made once."""
+    root = tmp_path_factory.mktemp("train")
+    collect.run(settings(), QUIET, out=root / "data")
+    train_encoder.run(settings(), QUIET, dataset=root / "data", out=root / "encoder")
+    return root
+
+
+def train(root: Path, out: str, **changes: object) -> Model:
+    result = train_hierarchy.run(
+        settings(**changes),
+        QUIET,
+        dataset=root / "data",
+        encoder=str(root / "encoder"),
+        out=root / out,
+    )
+    return Model.load(Path(result["checkpoint"]), "cpu")
+
+
+def test_the_encoder_run_repeats_to_the_last_bit(workplace: Path) -> None:
+    train_encoder.run(settings(), QUIET, dataset=workplace / "data", out=workplace / "again")
+    first, again = (
+        load_checkpoint(workplace / name / "model.safetensors") for name in ("encoder", "again")
+    )
+    assert first.digest == again.digest
+    train_encoder.run(settings(seed=1), QUIET, dataset=workplace / "data", out=workplace / "other")
+    assert load_checkpoint(workplace / "other" / "model.safetensors").digest != first.digest
+
+
+def test_the_encoder_checkpoint_says_all_about_itself(workplace: Path) -> None:
+    metadata = load_checkpoint(workplace / "encoder" / "model.safetensors").metadata
+    assert metadata["plant"] == "desktop" and metadata["seed"] == 0
+    assert set(metadata["health"]["probe_r2"]) == {"x", "x_dot", "theta", "theta_dot"}
+    assert metadata["settings"]["encoder"]["steps"] == 4
+    assert metadata["camera"]["width_px"] == 128 and len(metadata["dataset"]) == 64
+
+
+def test_a_missed_gate_stops_the_pipeline_and_leaves_no_checkpoint(workplace: Path) -> None:
+    out = workplace / "gated"
+    with pytest.raises(NumericalError, match=r"failed its gate.*theta") as caught:
+        train_encoder.run(settings(encoder__gate=True), QUIET, dataset=workplace / "data", out=out)
+    assert "--no-gate" in str(caught.value.hint)
+    assert not (out / "model.safetensors").exists() and not (out / "result.json").exists()
+
+
+def test_gates_pass_exactly_at_their_thresholds() -> None:
+    options = load_settings().encoder
+    health = {
+        "probe_r2": {"x": 0.95, "x_dot": 0.90, "theta": 0.80, "theta_dot": 0.90},
+        "effective_rank": 4.0,
+        "std": 0.0,
+        "action_sensitivity": 0.1,
+        "actor_nrmse": 0.35,
+    }
+    gates = train_encoder.judge(health, options)
+    assert len(gates) == 7 and all(gate["passed"] for gate in gates.values())
+    for change in ({"effective_rank": 3.99}, {"actor_nrmse": 0.36}, {"action_sensitivity": 0.0}):
+        failed = train_encoder.judge(health | change, options)
+        assert [name for name, gate in failed.items() if not gate["passed"]] == list(change)
+    assert not train_encoder.judge(health | {"effective_rank": float("nan")}, options)[
+        "effective_rank"
+    ]["passed"]
+
+
+def test_the_hierarchy_takes_the_encoder_as_it_is(workplace: Path) -> None:
+    model = train(workplace, "hierarchy")
+    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"), "encoder")
+    taken = model.modules["encoder"].state_dict()
+    for name, tensor in source["encoder"].state_dict().items():
+        assert torch.equal(taken[name], tensor), name
+    assert model.methods == ("hjepa", "ts-jepa-4", "ts-jepa-1", "hold", "zero")
+    with (workplace / "hierarchy" / "metrics.csv").open() as lines:
+        assert {row["level"] for row in csv.DictReader(lines)} == {"high", "medium", "low", "flat"}
+
+
+def test_the_hierarchy_run_repeats_to_the_last_bit(workplace: Path) -> None:
+    digests = {train(workplace, name, seed=5).digest for name in ("once", "twice")}
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize(("h", "m", "l"), [(8, 2, 1), (4, 4, 1), (4, 4, 4), (6, 2, 2), (1, 1, 1)])
+def test_other_strides_train_and_play(workplace: Path, h: int, m: int, l: int) -> None:
+    model = train(workplace, f"strides-{h}-{m}-{l}", hierarchy__h=h, hierarchy__m=m, hierarchy__l=l)
+    z = model.encode(np.zeros((3, 2, 64, 128, 3), np.uint8))
+    for method in ("hjepa", f"ts-jepa-{h}", "ts-jepa-1"):
+        planner = model.planner(method)
+        with torch.inference_mode():
+            forces_n, z_next = planner.plan(z)
+        assert forces_n.shape == (3, planner.stride) and z_next.shape == z.shape
+        assert (forces_n.abs() <= 20.0).all()
+    assert model.planner("hjepa").stride == h
+
+
+def test_the_companion_is_the_start_of_the_high_level_where_h_agrees(workplace: Path) -> None:
+    frozen = {"hierarchy__coarse_learning_rate": 0.0}
+    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"), "encoder")
+    started = train(workplace, "from-companion", **frozen).modules["high"].state_dict()
+    for name, tensor in source["high"].state_dict().items():
+        assert torch.equal(started[name], tensor), name
+
+
+def test_an_interrupted_run_starts_again_and_ends_the_same(workplace: Path) -> None:
+    out = workplace / "interrupted"
+    options = settings()
+    spoiled = dataclasses.replace(options, encoder=dataclasses.replace(options.encoder, gate=True))
+    with pytest.raises(NumericalError):
+        train_encoder.run(spoiled, QUIET, dataset=workplace / "data", out=out)
+    with pytest.raises(NumericalError):  # same settings: taken up, metrics not doubled
+        train_encoder.run(spoiled, QUIET, dataset=workplace / "data", out=out)
+    fresh = (workplace / "gated" / "metrics.csv").read_bytes()
+    assert (out / "metrics.csv").read_bytes() == fresh
+    assert len(fresh.splitlines()) == 2
+
+
+def test_a_hierarchy_checkpoint_is_no_encoder(workplace: Path) -> None:
+    train(workplace, "hierarchy-again")
+    with pytest.raises(DataError, match="of train-hierarchy, not of train-encoder"):
+        train_hierarchy.run(
+            settings(),
+            QUIET,
+            dataset=workplace / "data",
+            encoder=str(workplace / "hierarchy-again"),
+            out=workplace / "wrong",
+        )
+    assert not (workplace / "wrong" / "model.safetensors").exists()
