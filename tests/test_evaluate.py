@@ -17,7 +17,6 @@ from hjepa_cli.core.methods import (
     TRUE_STATE,
     embedding_method,
     embedding_sensor,
-    one_core_per_thread,
     true_state_method,
 )
 from hjepa_cli.core.model import Model, build_modules, tensors_of
@@ -25,7 +24,9 @@ from hjepa_cli.core.payload import quantise
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.policy import teacher
 from hjepa_cli.core.protocol import Point
-from hjepa_cli.errors import DataError, MissingInputError, UsageError
+from hjepa_cli.core.simulator import Block, Simulator, run_points
+from hjepa_cli.core.workers import Workers
+from hjepa_cli.errors import DataError, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import evaluate
@@ -85,11 +86,13 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An empty working directory, no zoo, and no fight for cores over tiny batches."""
+    """An empty working directory, no zoo, and no threads that fight over tiny batches."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(zoo, "zoo_directory", lambda: tmp_path / "zoo")
-    with one_core_per_thread():
-        yield
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture
@@ -392,6 +395,86 @@ def test_damaged_curves_are_refused_beside_a_model_and_passed_over_elsewhere(
     assert curves.read(beside, digest) == {"hjepa": entry_of(0.5)}
 
 
+# --- Blocks and workers -------------------------------------------------------------------------
+
+
+def test_blocks_cover_the_devices_and_do_not_depend_on_the_runner() -> None:
+    settings = small(bracket_devices=150, steps=2)
+    asked: list[Block] = []
+
+    def runner(blocks: Any, tick: Any) -> Any:
+        asked.extend(blocks)
+        return Simulator(settings, None)(blocks, tick)
+
+    ticks: list[int] = []
+    points = [Point("gap", 2.0), Point("delivery", 8.0)]
+    outcome = run_points(runner, "oracle", points, 150, ticks.append)
+    assert [(block.start, block.stop) for block in asked] == [(0, 64), (64, 128), (128, 150)]
+    assert outcome.score.shape == outcome.cost.shape == (2, 150)
+    assert sum(ticks) == 2 * 150 * 2  # points, devices, steps
+    few: list[Block] = []
+    run_points(
+        lambda blocks, tick: few.extend(blocks) or runner(blocks, tick), "oracle", points, 5, print
+    )
+    assert [(block.start, block.stop) for block in few] == [(0, 3), (3, 5)]
+
+
+def test_a_block_of_some_devices_equals_those_among_all() -> None:
+    settings = small(bracket_devices=12, steps=40)
+    simulator = Simulator(settings, None)
+    points = (Point("gap", 6.5), Point("delivery", 9.0))
+    every, some = (
+        simulator.run(Block("hold-true", points, start, stop), lambda steps: None)
+        for start, stop in ((0, 12), (5, 8))
+    )
+    assert some.cost == pytest.approx(every.cost[:, 5:8], rel=1e-12)
+
+
+def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
+    settings = small(steps=8)
+    model = Model.load(checkpoint, "cpu")
+    ticks: list[int] = []
+    with Workers(settings, checkpoint, 2) as workers:
+        for name in ("oracle", "hjepa"):
+            points = [Point("gap", 3.0)]
+            theirs = run_points(workers, name, points, 4, ticks.append)
+            ours = run_points(Simulator(settings, model), name, points, 4, lambda steps: None)
+            assert np.array_equal(theirs.score, ours.score)
+            assert theirs.cost == pytest.approx(ours.cost, rel=1e-6)
+        with pytest.raises(UsageError, match="no method 'ts-jepa-5'"):
+            run_points(workers, "ts-jepa-5", points, 4, ticks.append)
+        assert run_points(workers, "oracle", points, 4, ticks.append).cost == pytest.approx(
+            run_points(Simulator(settings, model), "oracle", points, 4, ticks.append).cost
+        )
+
+
+def test_a_dead_worker_is_reported_and_none_is_left_behind(checkpoint: Path) -> None:
+    with Workers(small(steps=8), None, 2) as workers:
+        processes = [worker._process for worker in workers._workers]
+        for process in processes:
+            process.kill()
+        with pytest.raises(NumericalError, match="a worker process ended with code -9"):
+            run_points(workers, "oracle", [Point("gap", 3.0)], 4, lambda steps: None)
+    assert [process.poll() for process in processes] == [-9, -9]
+
+
+def test_eval_uses_workers_where_they_are_worth_it(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = small(methods=("oracle", "zero-true"))
+    monkeypatch.setattr(evaluate, "cores", lambda: 2)
+    alone = evaluate.run(settings, Output().screen, checkpoint=str(checkpoint))
+    made: list[Workers] = []
+    init = Workers.__init__
+    monkeypatch.setattr(evaluate, "WORTH_WORKERS", 0)
+    monkeypatch.setattr(
+        Workers, "__init__", lambda self, *a: (made.append(self), init(self, *a))[1]
+    )
+    shared = evaluate.run(settings, Output().screen, checkpoint=str(checkpoint), remeasure=True)
+    assert len(made) == 1
+    assert shared["methods"] == alone["methods"]
+
+
 # --- What pixels become -------------------------------------------------------------------------
 
 
@@ -505,13 +588,12 @@ def test_oracle_and_optimal_make_no_error_on_clean_rollouts() -> None:
 )
 def test_ceilings_of_the_protocol(preset: str, expected: dict[str, Any]) -> None:
     settings = load_settings(preset)
-    chosen = plant(settings.plant)
-    bench = Bench(chosen, settings.protocol, settings.seed)
+    bench = Bench(settings.protocol, settings.seed, Simulator(settings, None))
     assert bench.teacher_score >= evaluate.MIN_TEACHER_SCORE
     assert bench.teacher_score == pytest.approx(expected.pop("teacher"), abs=0.035)
     for name, ceiling in expected.items():
         points = [Point("gap", float(gap)) for gap in ceiling]
-        outcome = bench.measure(true_state_method(name, chosen, 0), points, 128)
+        outcome = bench.measure(name, points, 128)
         entries = bench.reference.describe(points, outcome)
         for entry, score in zip(entries, ceiling.values(), strict=True):
             half_width = (entry["ci95"][1] - entry["ci95"][0]) / 2

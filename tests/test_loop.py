@@ -107,7 +107,7 @@ def test_probabilities_outside_the_unit_interval_are_refused(p: float) -> None:
 def test_draws_do_not_depend_on_how_many_devices_there_are() -> None:
     few, many = (Draws.make(protocol(plant_spread=0.1), count, seed=3) for count in (5, 12))
     for name in ("initial", "noise", "delivery", "mass_scale"):
-        assert np.array_equal(getattr(few, name), getattr(many.first(5), name)), name
+        assert np.array_equal(getattr(few, name), getattr(many.part(slice(5)), name)), name
 
 
 def test_draws_differ_between_seeds_and_devices_but_not_between_calls() -> None:
@@ -192,7 +192,7 @@ def test_first_devices_do_as_they_do_among_many() -> None:
         controller = LastForce(teacher("desktop"), some.devices, keep=True)
         return simulate(DESKTOP, some, schedule, controller, true_state).cost[0]
 
-    assert run(draws.first(2)) == pytest.approx(run(draws)[:2], rel=1e-12)
+    assert run(draws.part(slice(2))) == pytest.approx(run(draws)[:2], rel=1e-12)
 
 
 class Recorder:

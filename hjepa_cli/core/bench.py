@@ -1,21 +1,18 @@
 """The bench that all methods are compared on: one plant, one protocol, one set of draws."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hjepa_cli.core import metrics
-from hjepa_cli.core.loop import Controller, Draws, Floats, Outcome, every_step, play, simulate
-from hjepa_cli.core.methods import Method, true_state_method
-from hjepa_cli.core.plant import Plant
+from hjepa_cli.core.loop import Floats, Outcome, play
+from hjepa_cli.core.methods import Method
 from hjepa_cli.core.protocol import KINDS, Curves, Point, Reference, measure_curves
+from hjepa_cli.core.simulator import Runner, Tick, run_points
 from hjepa_cli.settings import ProtocolSettings
 
-Tick = Callable[[], None]
-"""Called after every simulated control step, for progress."""
-
+EVERY_STEP = Point("gap", 1.0)
 TOLERANCES = (
     *("gap_steps", "gap_ci95", "gap_censored", "gap_lq_steps"),
     *("p", "p_ci95", "p_censored", "p_lq"),
@@ -23,13 +20,13 @@ TOLERANCES = (
 
 
 class Bench:
-    """Measures methods, and holds what they share: the draws and the teacher's run.
+    """Measures methods, and holds what they share: the teacher's run and each family's first point.
 
     Args:
-        plant: the cart-pole.
         protocol: draws, grid, devices, level.
-        seed: of draws and bootstrap.
-        tick: see :data:`Tick`; may be set to another one at any time.
+        seed: of the bootstrap.
+        runner: simulates.
+        tick: shows progress; may be set to another one at any time.
 
     Attributes:
         reference: the teacher, on the true state at every step, with all devices.
@@ -37,17 +34,18 @@ class Bench:
 
     def __init__(
         self,
-        plant: Plant,
         protocol: ProtocolSettings,
         seed: int,
-        tick: Tick = lambda: None,
+        runner: Runner,
+        tick: Tick = lambda steps: None,
     ) -> None:
-        self.plant, self.protocol, self.tick = plant, protocol, tick
-        devices = max(protocol.curve_devices, protocol.bracket_devices)
-        self._draws = Draws.make(protocol, devices, seed)
+        self.protocol, self.tick = protocol, tick
+        self._runner = runner
         self._every_step: dict[str, Outcome] = {}
-        teacher = self._at_every_step(true_state_method("optimal", plant, 0), devices)
-        self._every_step["state"] = _first(teacher, protocol.curve_devices)
+        devices = max(protocol.curve_devices, protocol.bracket_devices)
+        teacher = self._at_every_step("optimal", devices)
+        few = protocol.curve_devices
+        self._every_step["state"] = Outcome(teacher.score[:, :few], teacher.cost[:, :few])
         self.reference = Reference(teacher.score[0], teacher.cost[0], protocol.bootstrap, seed)
 
     @property
@@ -55,19 +53,17 @@ class Bench:
         """The teacher's own share of steps inside the band; a sound protocol has 0.85 or more."""
         return float(self.reference.score.mean())
 
-    def measure(self, method: Method, points: Sequence[Point], devices: int) -> Outcome:
+    def measure(self, method: str, points: Sequence[Point], devices: int) -> Outcome:
         """Simulate a method at curve points with the first ``devices`` draws: [P, devices]."""
-        draws = self._draws.first(devices)
-        schedules = np.stack([point.schedule(draws) for point in points])
-        return self._simulate(method, method.controller(schedules[:, 0].size), draws, schedules)
+        return run_points(self._runner, method, points, devices, self.tick)
 
     def curves(self, method: Method) -> Curves:
         """Both curves and the searches for both tolerances."""
         if method.family not in self._every_step:
-            first = self._at_every_step(method, self.protocol.curve_devices)
+            first = self._at_every_step(method.name, self.protocol.curve_devices)
             self._every_step[method.family] = first
         return measure_curves(
-            lambda points, devices: self.measure(method, points, devices),
+            lambda points, devices: self.measure(method.name, points, devices),
             self._every_step[method.family],
             self.reference,
             self.protocol,
@@ -114,18 +110,8 @@ class Bench:
         crossing = metrics.first_crossing(gaps, ratios, level, log=kind == "delivery")
         return float(np.clip(crossing, 0.0, gaps[-1]))
 
-    def _at_every_step(self, method: Method, devices: int) -> Outcome:
-        draws = self._draws.first(devices)
-        schedule = every_step(draws.steps, devices)[None]
-        return self._simulate(method, method.reactive(devices), draws, schedule)
-
-    def _simulate(
-        self, method: Method, controller: Controller, draws: Draws, schedules: NDArray[np.bool_]
-    ) -> Outcome:
-        # The tick is looked up at every step: it changes with the method being measured.
-        return simulate(
-            self.plant, draws, schedules, controller, method.sensor, tick=lambda: self.tick()
-        )
+    def _at_every_step(self, method: str, devices: int) -> Outcome:
+        return run_points(self._runner, method, [EVERY_STEP], devices, self.tick, reactive=True)
 
 
 def control_errors(
@@ -206,7 +192,3 @@ def _flat_entry(protocol: ProtocolSettings) -> dict[str, Any]:
 def _probability(gap: float) -> float:
     """p = 1/g. A gap of 0 (not even every packet suffices) is p = 1: it leaves room for no one."""
     return 1 / gap if gap > 0 else 1.0
-
-
-def _first(outcome: Outcome, devices: int) -> Outcome:
-    return Outcome(outcome.score[:, :devices], outcome.cost[:, :devices])

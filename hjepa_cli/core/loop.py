@@ -97,13 +97,13 @@ class Draws:
     def steps(self) -> int:
         return len(self.noise)
 
-    def first(self, devices: int) -> "Draws":
-        """The draws of the first ``devices`` devices alone."""
+    def part(self, devices: slice) -> "Draws":
+        """The draws of some of the devices."""
         return Draws(
-            self.initial[:devices],
-            self.noise[:, :devices],
-            self.delivery[:, :devices],
-            self.mass_scale[:devices],
+            self.initial[devices],
+            self.noise[:, devices],
+            self.delivery[:, devices],
+            self.mass_scale[devices],
         )
 
 

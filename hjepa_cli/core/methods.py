@@ -7,10 +7,7 @@ and dequantised. Methods on the true state are anchors: what prediction could ga
 
 import dataclasses
 import functools
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,13 +21,14 @@ from hjepa_cli.core.loop import Controller, Floats, Sensor
 from hjepa_cli.core.payload import payload_bits, quantise
 from hjepa_cli.core.plant import Plant, plant
 from hjepa_cli.core.policy import teacher
+from hjepa_cli.errors import UsageError
+from hjepa_cli.settings import Settings
 
 if TYPE_CHECKING:
     from hjepa_cli.core.model import Model
 
 TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
 SENSOR_BATCH = 256  # frame pairs rendered and encoded at a time: 12 MiB
-SMALL_BATCH = 16  # not worth a second thread
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +52,21 @@ class Method:
     bits_per_transmission: int
     family: str
     uses_link: bool = True
+
+
+def build_method(name: str, settings: Settings, model: "Model | None") -> Method:
+    """Any method by its name, as the settings want it.
+
+    Raises:
+        UsageError: there is no model that holds it.
+    """
+    bits = settings.protocol.payload_bits_per_value
+    if name in TRUE_STATE:
+        sent = payload_bits(settings.encoder.embedding, bits)
+        return true_state_method(name, plant(settings.plant), sent)
+    if model is None:
+        raise UsageError(f"method '{name}' needs a model", hint="hjepa train-hierarchy")
+    return embedding_method(name, model, bits)
 
 
 def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Method:
@@ -100,44 +113,20 @@ def true_state(previous: Floats, states: Floats) -> Floats:
 
 
 def embedding_sensor(model: "Model", bits_per_value: int) -> Callable[[Floats, Floats], Tensor]:
-    """Sensor: render the last two frames, encode, quantise, dequantise.
-
-    Devices are shared out to one thread per core, which renders and encodes them; see
-    :func:`one_core_per_thread`.
-    """
+    """Sensor: render the last two frames, encode, quantise, dequantise."""
     camera = Camera(plant(model.plant_name))
-    workers = os.cpu_count() or 1
-    pool = ThreadPoolExecutor(workers)
-
-    def sense_some(pair: Floats) -> Tensor:
-        frames = camera.render(pair.reshape(-1, 4))
-        z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
-        return quantise(z, bits_per_value)
 
     def sense(previous: Floats, states: Floats) -> Tensor:
         """States [m, 4] one step before and now → received embeddings [m, D]."""
         pairs = np.stack([previous, states], axis=1)
-        size = min(max(-(-len(pairs) // workers), SMALL_BATCH), SENSOR_BATCH)
-        parts = [pairs[start : start + size] for start in range(0, len(pairs), size)]
-        received = pool.map(sense_some, parts) if len(parts) > 1 else map(sense_some, parts)
-        return torch.cat(list(received)).to(model.device)
+        received = []
+        for start in range(0, len(pairs), SENSOR_BATCH):
+            frames = camera.render(pairs[start : start + SENSOR_BATCH].reshape(-1, 4))
+            z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
+            received.append(quantise(z, bits_per_value))
+        return torch.cat(received).to(model.device)
 
     return sense
-
-
-@contextmanager
-def one_core_per_thread() -> Iterator[None]:
-    """Let PyTorch use one core per calling thread: the sensor's threads fill the others.
-
-    Many small batches side by side need no synchronisation inside each, which on a machine that
-    also does other work is several times faster.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _advance(kind: Plant, states: Floats, forces_n: Floats) -> Floats:

@@ -21,8 +21,8 @@ from hjepa_cli.settings import ProtocolSettings
 Floats = NDArray[np.float64]
 
 KINDS = ("gap", "delivery")
-STEP_OUT = 4  # brackets that a search goes outwards at a time, to find the end of an interval
-MAX_GUESSES = 4  # points of a search placed by interpolation, before it bisects
+STEP_OUT = 4  # brackets that a search goes outwards at a time, until the interval is inside
+MAX_GUESSES = 4  # points of a search placed by guessing, before it bisects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,27 +179,19 @@ class Search:
         for end in (left, right):
             if end is not None and end not in self._measured:
                 return end
-        return self._next_for_interval(gaps)
+        return self._next_for_interval()
 
-    def _next_for_interval(self, gaps: Sequence[float]) -> float | None:
+    def _next_for_interval(self) -> float | None:
         """Widen the measured range until the interval lies inside it."""
         first, last = min(self._measured), max(self._measured)
+        start, end = min(self._grid), max(self._grid)
         low, high = self._interval()
-        if low == -math.inf and first > gaps[0]:
-            return self._towards(first, gaps[gaps.index(first) - 1])
-        if high == math.inf and last < gaps[-1]:
-            return self._towards(last, gaps[gaps.index(last) + 1])
+        step = 1 + STEP_OUT * self._bracket
+        if low == -math.inf and first > start:
+            return max(first / step, start)
+        if high == math.inf and last < end:
+            return min(last * step, end)
         return None
-
-    def _towards(self, edge: float, neighbour: float) -> float:
-        """A step outwards: some brackets wide, at most half of the way, or all of a short way."""
-        width = 1 + self._bracket
-        way = neighbour / edge
-        if 1 / width <= way <= width:
-            return neighbour
-        step = self._middle(edge, neighbour) / edge
-        far = 1 + STEP_OUT * self._bracket
-        return edge * (min(step, far) if way > 1 else max(step, 1 / far))
 
     def _best_known(self) -> dict[float, float]:
         """Scores by gap: with many devices where measured, else the grid's."""
@@ -220,17 +212,35 @@ class Search:
     def _between(self, left: float, right: float, scores: Mapping[float, float]) -> float:
         """Where to cut a bracket that is too wide.
 
-        At the interpolated crossing, but a bracket's width away from either end: near an end that
+        At the guessed crossing, but a bracket's width away from either end: near an end that
         closes the bracket at once. In the middle where the bracket is short, and when guessing
         has not helped.
         """
         width = 1 + self._bracket
         if len(self._measured) >= MAX_GUESSES or right / left <= width**2:
             return self._middle(left, right)
-        ends = np.array([left, right])
-        values = np.array([scores[left], scores[right]])
-        guess = float(metrics.first_crossing(ends, values, self._level, log=self._log))
+        guess = self._guess(left, right, scores)
         return min(max(guess, left * width), right / width)
+
+    def _guess(self, left: float, right: float, scores: Mapping[float, float]) -> float:
+        """The crossing on a line: between the ends, unless just one of them is measured.
+
+        Then the line goes through that one, with the grid's slope: few devices tell how steep a
+        curve is better than how high.
+        """
+        known = [gap for gap in (left, right) if gap in self._measured]
+        to, back = (math.log, math.exp) if self._log else (float, float)
+        through, drop = left, scores[left] - scores[right]
+        if len(known) == 1:
+            through, drop = known[0], self._on_grid(left) - self._on_grid(right)
+        if drop <= 0:
+            return self._middle(left, right)
+        steps = (scores[through] - self._level) / drop
+        return back(min(to(through) + steps * (to(right) - to(left)), to(max(self._grid))))
+
+    def _on_grid(self, gap: float) -> float:
+        """The score that few devices have at any gap, interpolated."""
+        return float(np.interp(gap, list(self._grid), list(self._grid.values())))
 
     def _middle(self, left: float, right: float) -> float:
         return math.sqrt(left * right) if self._log else (left + right) / 2

@@ -6,7 +6,7 @@ all they depend on, and a table. ``scale`` takes the same curves through :func:`
 
 import dataclasses
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,21 +14,16 @@ from typing import Any
 from hjepa_cli.checks import check_methods
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.loop import Floats
-from hjepa_cli.core.methods import (
-    TRUE_STATE,
-    Method,
-    embedding_method,
-    one_core_per_thread,
-    true_state_method,
-)
+from hjepa_cli.core.methods import TRUE_STATE, build_method
 from hjepa_cli.core.metrics import WINDOWS
 from hjepa_cli.core.model import Model
-from hjepa_cli.core.payload import payload_bits
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
+from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.trajectories import generate
+from hjepa_cli.core.workers import MAX_WORKERS, Workers, cores
 from hjepa_cli.errors import DataError, UsageError
-from hjepa_cli.screen import Advance, Screen
+from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage import curves, runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
@@ -38,7 +33,8 @@ from hjepa_cli.storage.runs import Run
 from hjepa_cli.storage.zoo import CURVES_FILE
 
 MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods (spec §4)
-USUAL_SIMULATIONS = 8  # of one method, for its progress bar: the grid, then the bisection
+USUAL_ROUNDS = 5  # of the search for tolerances, for the progress bar
+WORTH_WORKERS = 50_000  # device-steps per point; below, processes cost more than they bring
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,10 +185,11 @@ def measure_points(
         )
     points = [Point("gap", gap) for gap in gaps]
     points += [Point("delivery", 1 / p) for p in probabilities]
-    with _ticking(screen, f"verify {method}", 2 * settings.protocol.steps) as bar:
-        bench = Bench(plant(settings.plant), settings.protocol, settings.seed, bar.advance)
-        devices = settings.protocol.bracket_devices
-        outcome = bench.measure(_method(method, subject), points, devices)
+    devices = settings.protocol.bracket_devices
+    device_steps = (len(points) + 1) * _device_steps(settings)
+    with _runner(subject) as runner, _ticking(screen, f"verify {method}", device_steps) as tick:
+        bench = Bench(settings.protocol, settings.seed, runner, tick)
+        outcome = bench.measure(method, points, devices)
     return bench.reference.describe(points, outcome)
 
 
@@ -262,22 +259,11 @@ def _evaluate(
     keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
     missing = [name for name in subject.measurable(methods) if name not in found]
     if missing:
-        clean = _clean_rollouts(subject)
-        with _ticking(screen, "eval teacher", settings.protocol.steps) as bar:
-            bench = Bench(plant(settings.plant), settings.protocol, settings.seed, bar.advance)
-        if bench.teacher_score < MIN_TEACHER_SCORE:
-            screen.say(
-                f"the teacher itself scores only {bench.teacher_score:.2f} here (a sound protocol "
-                f"gives it {MIN_TEACHER_SCORE}): normalised scores say little"
-            )
-    for name in missing:
-        with _ticking(screen, f"eval {name}", USUAL_SIMULATIONS * settings.protocol.steps) as bar:
-            bench.tick = bar.advance
-            entry = _measure(_method(name, subject), bench, clean, settings)
-        for path in keep:
-            curves.write(path, subject.digest, {name: entry})
-        record.event("measured", method=name)
-        found[name] = (entry, own)
+        for name, entry in _measure(subject, screen, missing):
+            for path in keep:
+                curves.write(path, subject.digest, {name: entry})
+            record.event("measured", method=name)
+            found[name] = (entry, own)
     curves.write(own, subject.digest, {name: entry for name, (entry, _) in found.items()})
     return {
         "checkpoint": subject.path,
@@ -292,27 +278,45 @@ def _evaluate(
 
 
 def _measure(
-    method: Method, bench: Bench, clean: tuple[Floats, Floats], settings: Settings
-) -> Entry:
-    """One method's entry of ``eval --json`` (spec §8)."""
-    horizon, replicates = settings.protocol.horizon, settings.protocol.bootstrap
-    errors = control_errors(method, *clean, bench.plant.force_limit_n, horizon)
-    return {
-        **control_entry(errors, replicates, settings.seed),
-        **bench.entry(method),
-        "teacher_score": bench.teacher_score,
-        "seed": settings.seed,
-    }
+    subject: Subject, screen: Screen, methods: Sequence[str]
+) -> Iterator[tuple[str, Entry]]:
+    """Entries of ``eval --json`` (spec §8), one method after the other."""
+    settings, protocol = subject.settings, subject.settings.protocol
+    states, teacher_n = _clean_rollouts(subject)
+    limit_n = plant(settings.plant).force_limit_n
+    with _runner(subject) as runner:
+        with _ticking(screen, "eval teacher", _device_steps(settings)) as tick:
+            bench = Bench(protocol, settings.seed, runner, tick)
+        if bench.teacher_score < MIN_TEACHER_SCORE:
+            screen.say(
+                f"the teacher itself scores only {bench.teacher_score:.2f} here (a sound protocol "
+                f"gives it {MIN_TEACHER_SCORE}): normalised scores say little"
+            )
+        for name in methods:
+            method = build_method(name, settings, subject.model)
+            with _ticking(screen, f"eval {name}", _usual_device_steps(settings)) as tick:
+                bench.tick = tick
+                errors = control_errors(method, states, teacher_n, limit_n, protocol.horizon)
+                yield (
+                    name,
+                    {
+                        **control_entry(errors, protocol.bootstrap, settings.seed),
+                        **bench.entry(method),
+                        "teacher_score": bench.teacher_score,
+                        "seed": settings.seed,
+                    },
+                )
 
 
-def _method(name: str, subject: Subject) -> Method:
-    settings = subject.settings
-    bits = settings.protocol.payload_bits_per_value
-    if name in TRUE_STATE:
-        sent = payload_bits(settings.encoder.embedding, bits)
-        return true_state_method(name, plant(settings.plant), sent)
-    assert subject.model is not None
-    return embedding_method(name, subject.model, bits)
+@contextmanager
+def _runner(subject: Subject) -> Iterator[Runner]:
+    """Simulate in one process per core, or in this one where that is enough."""
+    settings, count = subject.settings, min(cores(), MAX_WORKERS)
+    if count > 1 and _device_steps(settings) >= WORTH_WORKERS:
+        with Workers(settings, subject.path, count) as workers:
+            yield workers
+    else:
+        yield Simulator(settings, subject.model)
 
 
 def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:
@@ -379,23 +383,31 @@ def _is_run(directory: Path) -> bool:
     return (directory / runs.CONFIG).is_file() and os.access(directory, os.W_OK)
 
 
+def _device_steps(settings: Settings) -> int:
+    """Of one curve point with all devices."""
+    return settings.protocol.steps * settings.protocol.bracket_devices
+
+
+def _usual_device_steps(settings: Settings) -> int:
+    """Of one method: two grids, then rounds of two points."""
+    protocol = settings.protocol
+    grids = 2 * len(protocol.gaps) * protocol.curve_devices * protocol.steps
+    return grids + 2 * USUAL_ROUNDS * _device_steps(settings)
+
+
 @contextmanager
-def _ticking(screen: Screen, label: str, steps: int) -> Iterator[Advance]:
-    """A progress bar over control steps whose number is a guess: it neither overruns nor stops."""
-    with one_core_per_thread(), screen.progress(label, steps, "steps") as bar:
-        counter = _Counter(bar, steps)
-        yield counter
-        counter.advance(steps)
+def _ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A progress bar over device-steps whose number is a guess: it ends full, never overfull."""
+    left = total
+    with screen.progress(label, total, "device-steps") as bar:
 
+        def tick(steps: int) -> None:
+            nonlocal left
+            bar.advance(min(steps, left))
+            left -= min(steps, left)
 
-class _Counter:
-    def __init__(self, bar: Advance, total: int) -> None:
-        self._bar, self._left = bar, total
-
-    def advance(self, count: int = 1, **fields: float) -> None:
-        count = min(count, self._left)
-        self._left -= count
-        self._bar.advance(count, **fields)
+        yield tick
+        tick(total)
 
 
 def _number(value: float | None, decimals: int) -> str | None:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from hjepa_cli.storage.datasets import (
     find_newest_dataset,
     load_dataset,
 )
+from hjepa_cli.storage.runs import Run
 
 RENDER_CHUNK = 20  # trajectories per call, so that progress shows
 
@@ -100,6 +103,21 @@ def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> Rende
         actions=torch.from_numpy(trajectories.applied_n / limit_n),
         labels=torch.from_numpy(trajectories.teacher_n / limit_n),
     )
+
+
+@contextmanager
+def training_run(stage: str, out: Path | None, settings: Settings, screen: Screen) -> Iterator[Run]:
+    """The run directory of a training stage, its ``result`` set if it is a finished one.
+
+    An interrupted run starts again: the seed decides everything, so it ends as it would have.
+    """
+    with Run.create(stage, out, settings.as_dict()) as record:
+        if record.result is not None:
+            screen.say(f"{record.directory} is finished; this is its result")
+        elif record.resumed:
+            screen.say(f"{record.directory} was interrupted; it starts again from the same seed")
+            record.keep_metrics(0)
+        yield record
 
 
 def versions() -> dict[str, str]:

@@ -24,7 +24,7 @@ from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_devi
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import EncoderSettings, Settings
-from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, versions
+from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, training_run, versions
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 from hjepa_cli.storage.runs import Run
 
@@ -43,13 +43,9 @@ def run(
     """
     data = open_dataset(dataset, settings)
     recorded = {split: data.split(split) for split in ("train", "test")}
-    with Run.create("train-encoder", out, settings.as_dict()) as record:
+    with training_run("train-encoder", out, settings, screen) as record:
         if record.result is not None:
-            screen.say(f"{record.directory} is finished; this is its result")
             return record.result
-        if record.resumed:
-            screen.say("this run was interrupted; it starts again from the same seed")
-            record.keep_metrics(0)
         started = time.perf_counter()
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path} ({settings.plant}), run {record.directory}")

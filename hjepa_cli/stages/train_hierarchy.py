@@ -26,7 +26,7 @@ from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_devi
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, versions
+from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, training_run, versions
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
 from hjepa_cli.storage.datasets import Dataset
 from hjepa_cli.storage.runs import Run, newest_run, read_config
@@ -56,13 +56,9 @@ def run(
     data = open_dataset(dataset, settings)
     recorded = data.split("train")
     source = open_encoder(encoder, settings)
-    with Run.create("train-hierarchy", out, settings.as_dict()) as record:
+    with training_run("train-hierarchy", out, settings, screen) as record:
         if record.result is not None:
-            screen.say(f"{record.directory} is finished; this is its result")
             return record.result
-        if record.resumed:
-            screen.say("this run was interrupted; it starts again from the same seed")
-            record.keep_metrics(0)
         started = time.perf_counter()
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path}, encoder {source.path}, run {record.directory}")
