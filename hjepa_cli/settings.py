@@ -80,8 +80,10 @@ class ActorSettings:
 
     hidden: int
     dropout: float
+    schedule: Literal["one-cycle", "constant"]
     learning_rate: float
     weight_decay: float
+    gradient_clip: float
     batch: int
     epochs: int
 

@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import types
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,12 @@ from hypothesis import strategies as st
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
 from hjepa_cli.core.dynamics import rk4_step
 from hjepa_cli.core.loop import Controller, Draws, every_step, gap_schedule, simulate
-from hjepa_cli.core.methods import TRUE_STATE, true_state_method
+from hjepa_cli.core.methods import TRUE_STATE, embedding_method, true_state_method
+from hjepa_cli.core.model import Model, build_modules
 from hjepa_cli.core.plant import CartPole, CartPoles, plant
 from hjepa_cli.core.policy import teacher
 from hjepa_cli.settings import load_settings
+from hjepa_cli.stages.train_encoder import describe_architecture
 
 DESKTOP = plant("desktop")
 
@@ -177,17 +180,33 @@ def controllers() -> dict[str, Controller]:
     return built | {"stride": StrideController(Linear(4), 2)}
 
 
-@pytest.mark.parametrize("name", [*TRUE_STATE, "stride"])
-def test_no_controller_holds_a_plant(name: str) -> None:
+def embedding_controllers() -> dict[str, Controller]:
+    settings = load_settings(flags={"encoder.hidden": 8})
+    architecture = describe_architecture(settings) | {
+        "kind": "hierarchy",
+        "actor_hidden": 8,
+        "actor_dropout": 0.0,
+    }
+    metadata = {
+        "architecture": architecture,
+        "plant": "desktop",
+        "settings": settings.as_dict(),
+    }
+    model = Model(build_modules(architecture), metadata, "", "cpu")
+    return {name: embedding_method(name, model, 8).controller(2) for name in model.methods}
+
+
+@pytest.mark.parametrize("build", [controllers, embedding_controllers])
+def test_no_controller_holds_a_plant(build: Callable[[], dict[str, Controller]]) -> None:
     forbidden = (CartPoles, CartPole, pymunk.Space, pymunk.Body)
-    controller = controllers()[name]
-    held = reachable(controller)
-    assert len(held) > 5
-    assert not [item for item in held if isinstance(item, forbidden)]
-    # The walk would find one.
-    poles = CartPoles(DESKTOP, 1)
-    smuggled = types.SimpleNamespace(inner=controller, act=lambda: poles.states)
-    assert [item for item in reachable(smuggled) if isinstance(item, forbidden)]
+    for name, controller in build().items():
+        held = reachable(controller)
+        assert len(held) > 5
+        assert not [item for item in held if isinstance(item, forbidden)], name
+        # The walk would find one.
+        poles = CartPoles(DESKTOP, 1)
+        smuggled = types.SimpleNamespace(inner=controller, act=lambda poles=poles: poles.states)
+        assert [item for item in reachable(smuggled) if isinstance(item, forbidden)], name
 
 
 @pytest.mark.parametrize("name", [*TRUE_STATE, "stride"])

@@ -441,7 +441,7 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
             ours = run_points(Simulator(settings, model), name, points, 4, lambda steps: None)
             assert np.array_equal(theirs.score, ours.score)
             assert theirs.cost == pytest.approx(ours.cost, rel=1e-6)
-        with pytest.raises(UsageError, match="no method 'ts-jepa-5'"):
+        with pytest.raises(UsageError, match="ts-jepa-5"):
             run_points(workers, "ts-jepa-5", points, 4, ticks.append)
         assert run_points(workers, "oracle", points, 4, ticks.append).cost == pytest.approx(
             run_points(Simulator(settings, model), "oracle", points, 4, ticks.append).cost
@@ -461,18 +461,33 @@ def test_a_dead_worker_is_reported_and_none_is_left_behind(checkpoint: Path) -> 
 def test_eval_uses_workers_where_they_are_worth_it(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = small(methods=("oracle", "zero-true"))
-    monkeypatch.setattr(evaluate, "cores", lambda: 2)
-    alone = evaluate.run(settings, Output().screen, checkpoint=str(checkpoint))
-    made: list[Workers] = []
-    init = Workers.__init__
-    monkeypatch.setattr(evaluate, "WORTH_WORKERS", 0)
-    monkeypatch.setattr(
-        Workers, "__init__", lambda self, *a: (made.append(self), init(self, *a))[1]
-    )
-    shared = evaluate.run(settings, Output().screen, checkpoint=str(checkpoint), remeasure=True)
-    assert len(made) == 1
-    assert shared["methods"] == alone["methods"]
+    asked: list[tuple[Path | None, int]] = []
+
+    class Fake(Simulator):
+        def __init__(self, settings: Settings, model_path: Path | None, count: int) -> None:
+            asked.append((model_path, count))
+            super().__init__(settings, None)
+
+        def __enter__(self) -> "Fake":
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            asked.append((None, 0))
+
+    monkeypatch.setattr(evaluate, "Workers", Fake)
+    for available, worth, expected in (
+        (2, 24 * 4, [(checkpoint, 2), (None, 0)]),
+        (64, 24 * 4, [(checkpoint, 8), (None, 0)]),
+        (2, 24 * 4 + 1, []),
+        (1, 1, []),
+    ):
+        monkeypatch.setattr(evaluate, "cores", lambda available=available: available)
+        monkeypatch.setattr(evaluate, "WORTH_WORKERS", worth)
+        evaluate.measure_points(
+            small(), Output().screen, method="oracle", gaps=[3], checkpoint=str(checkpoint)
+        )
+        assert asked == expected
+        asked.clear()
 
 
 # --- What pixels become -------------------------------------------------------------------------

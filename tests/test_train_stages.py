@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hjepa_cli.core.model import Model, load_modules
-from hjepa_cli.errors import DataError, NumericalError
+from hjepa_cli.errors import DataError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import collect, train_encoder, train_hierarchy
@@ -80,6 +80,7 @@ def test_a_missed_gate_stops_the_pipeline_and_leaves_no_checkpoint(workplace: Pa
     with pytest.raises(NumericalError, match=r"failed its gate.*theta") as caught:
         train_encoder.run(settings(encoder__gate=True), QUIET, dataset=workplace / "data", out=out)
     assert "--no-gate" in str(caught.value.hint)
+    assert "rejected.safetensors" in str(caught.value.hint)
     assert not (out / "model.safetensors").exists() and not (out / "result.json").exists()
 
 
@@ -104,7 +105,7 @@ def test_gates_pass_exactly_at_their_thresholds() -> None:
 
 def test_the_hierarchy_takes_the_encoder_as_it_is(workplace: Path) -> None:
     model = train(workplace, "hierarchy")
-    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"), "encoder")
+    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"))
     taken = model.modules["encoder"].state_dict()
     for name, tensor in source["encoder"].state_dict().items():
         assert torch.equal(taken[name], tensor), name
@@ -133,7 +134,7 @@ def test_other_strides_train_and_play(workplace: Path, h: int, m: int, l: int) -
 
 def test_the_companion_is_the_start_of_the_high_level_where_h_agrees(workplace: Path) -> None:
     frozen = {"hierarchy__coarse_learning_rate": 0.0}
-    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"), "encoder")
+    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"))
     started = train(workplace, "from-companion", **frozen).modules["high"].state_dict()
     for name, tensor in source["high"].state_dict().items():
         assert torch.equal(started[name], tensor), name
@@ -152,14 +153,63 @@ def test_an_interrupted_run_starts_again_and_ends_the_same(workplace: Path) -> N
     assert len(fresh.splitlines()) == 2
 
 
-def test_a_hierarchy_checkpoint_is_no_encoder(workplace: Path) -> None:
-    train(workplace, "hierarchy-again")
-    with pytest.raises(DataError, match="of train-hierarchy, not of train-encoder"):
-        train_hierarchy.run(
-            settings(),
-            QUIET,
-            dataset=workplace / "data",
-            encoder=str(workplace / "hierarchy-again"),
-            out=workplace / "wrong",
-        )
-    assert not (workplace / "wrong" / "model.safetensors").exists()
+def test_any_checkpoint_brings_its_encoder_but_only_a_hierarchy_drives(workplace: Path) -> None:
+    first = train(workplace, "first")
+    result = train_hierarchy.run(
+        settings(),
+        QUIET,
+        dataset=workplace / "data",
+        encoder=str(workplace / "first"),
+        out=workplace / "on-a-hierarchy",
+    )
+    second = Model.load(Path(result["checkpoint"]), "cpu")
+    for name, tensor in first.modules["encoder"].state_dict().items():
+        assert torch.equal(second.modules["encoder"].state_dict()[name], tensor), name
+    with pytest.raises(DataError, match="of train-encoder, not of train-hierarchy"):
+        Model.load(workplace / "encoder" / "model.safetensors")
+
+
+def test_a_rejected_encoder_is_kept_apart_and_can_be_used(workplace: Path) -> None:
+    rejected = workplace / "gated" / "rejected.safetensors"
+    result = train_hierarchy.run(
+        settings(),
+        QUIET,
+        dataset=workplace / "data",
+        encoder=str(rejected),
+        out=workplace / "on-a-rejected",
+    )
+    assert load_checkpoint(Path(result["checkpoint"])).metadata["encoder"] == (
+        load_checkpoint(rejected).digest
+    )
+
+
+def test_without_mirroring_nothing_is_mirrored(workplace: Path, monkeypatch) -> None:
+    seen: list[tuple[torch.Tensor, torch.Tensor]] = []
+    fit = train_hierarchy.fit_actor
+
+    def spy(z, labels, *rest, **options):
+        seen.append((z, labels))
+        return fit(z, labels, *rest, **options)
+
+    monkeypatch.setattr(train_hierarchy, "fit_actor", spy)
+    train(workplace, "plain", encoder__mirror=False)
+    train(workplace, "mirrored")
+    (plain_z, plain), (both_z, both) = seen
+    assert len(plain) == 600 and torch.equal(both, torch.cat([plain, -plain]))
+    torch.testing.assert_close(both_z[:600], plain_z)
+
+
+def test_levels_do_not_disturb_each_other(workplace: Path) -> None:
+    short = train(workplace, "short", hierarchy__medium_steps=1)
+    long = train(workplace, "long", hierarchy__medium_steps=3)
+    for name in ("high", "flat"):
+        for a, b in zip(
+            short.modules[name].parameters(), long.modules[name].parameters(), strict=True
+        ):
+            assert torch.equal(a, b)
+
+
+def test_a_stride_longer_than_the_trajectories_is_refused_before_any_work(workplace: Path) -> None:
+    with pytest.raises(UsageError, match="100 steps; choose --h below 100"):
+        train(workplace, "too-long", hierarchy__h=128)
+    assert not (workplace / "too-long").exists()

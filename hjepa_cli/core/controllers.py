@@ -20,7 +20,9 @@ class Planner(Protocol):
     """Turns embeddings into one stride of forces and the embedding the next stride starts from."""
 
     @property
-    def stride(self) -> int: ...
+    def stride(self) -> int:
+        """Control steps planned at a time."""
+        ...
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Embeddings [n, D] → forces_n [n, stride], next embeddings [n, D]."""

@@ -9,7 +9,10 @@ from torch import nn
 class EmaTarget:
     """θ̄ ← η θ̄ + (1 − η) θ, equal at the start, without gradient; buffers follow too.
 
-    Floating-point buffers (running statistics) are averaged like parameters, others copied.
+    The target stays in the online network's mode at construction, training: it normalises by the
+    statistics of the batch, as the context encoder does on the same frames (ours). Its
+    floating-point buffers (running statistics) are averaged like parameters all the same, others
+    are copied, so that it can be evaluated too.
     """
 
     def __init__(self, online: nn.Module, decay: float) -> None:

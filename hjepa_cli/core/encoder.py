@@ -41,6 +41,7 @@ class ResidualBlock(nn.Module):
         self.project_norm = nn.BatchNorm2d(channels_out)
 
     def forward(self, x: Tensor) -> Tensor:
+        """[N, channels_in, H, W] → [N, channels_out, H / stride, W / stride]."""
         y = F.relu(self.norm1(self.conv1(x)))
         return F.relu(self.norm2(self.conv2(y)) + self.project_norm(self.project(x)))
 
@@ -79,12 +80,17 @@ class Encoder(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def fit_standardisation(self, frames: Tensor) -> None:
-        """Measure per-channel mean and standard deviation of both inputs on uint8 frames."""
+        """Measure per-channel mean and standard deviation of both inputs.
+
+        Args:
+            frames: uint8 [N, 2, 64, 128, 3], (previous, current).
+        """
         flat = self._inputs(frames).permute(0, 2, 3, 1).reshape(-1, 2 * CHANNELS).float()
         self.input_mean.copy_(flat.mean(0))
         self.input_std.copy_(flat.std(0).clamp_min(1e-3))
 
     def forward(self, frames: Tensor) -> Tensor:
+        """uint8 frames [N, 2, 64, 128, 3] → float32 embeddings [N, D]."""
         x = self._inputs(frames)
         if not torch.is_autocast_enabled(x.device.type):
             x = x.float()

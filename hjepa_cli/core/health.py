@@ -49,7 +49,7 @@ def action_sensitivity(
 
 
 def nrmse(predicted: Tensor, truth: Tensor) -> float:
-    """Root mean square error ÷ root mean square of the truth."""
+    """Root mean square error ÷ root mean square of the truth, over all of two equal shapes."""
     return float((predicted - truth).square().mean().sqrt() / truth.square().mean().sqrt())
 
 

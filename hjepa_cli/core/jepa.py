@@ -45,7 +45,11 @@ class Jepa:
         self.device = device
 
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
-        """Named loss terms of one batch, before weighting; names equal those of ``weights``."""
+        """Named scalar loss terms of one batch, before weighting, under the names of ``weights``.
+
+        Args:
+            batch: frames [B · F, 2, H, W, 3] and actions [B, F − 1, h], moved to the device here.
+        """
         frames, actions = batch.frames.to(self.device), batch.actions.to(self.device)
         windows, strides = actions.shape[0], actions.shape[1]
         z = self.encoder(frames).unflatten(0, (windows, strides + 1))

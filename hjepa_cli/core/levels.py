@@ -56,9 +56,13 @@ def flat_loss(
 
     Args:
         stride: control steps per call.
-        horizon_steps: K_p.
-        trajectories: windows drawn.
-        starts: rollouts started per window.
+        horizon_steps: K_p, in control steps.
+        trajectories: windows drawn, as long as the trajectories allow.
+        starts: rollouts started per window, at frames drawn without replacement.
+        generator: of windows and starts.
+
+    Returns:
+        Scalar cosine loss.
     """
     frames = data.window_frames(stride)
     rows, k, actions = data.windows(trajectories, frames, stride, generator)
@@ -79,7 +83,7 @@ def medium_loss(
     trajectories: int,
     generator: np.random.Generator,
 ) -> Tensor:
-    """Cosine loss of P^M inside the gaps of P^H's own rollouts."""
+    """Scalar cosine loss of P^M inside the gaps of P^H's own rollouts; see :func:`high_gaps`."""
     left, right, actions, steps = high_gaps(
         high, data, h, horizon_steps=horizon_steps, trajectories=trajectories, generator=generator
     )
@@ -100,7 +104,7 @@ def low_loss(
     trajectories: int,
     generator: np.random.Generator,
 ) -> Tensor:
-    """Cosine loss of P^L inside the m-steps that P^M laid between P^H's anchors."""
+    """Scalar cosine loss of P^L inside the m-steps that P^M laid between P^H's anchors."""
     left, right, actions, steps = high_gaps(
         high, data, h, horizon_steps=horizon_steps, trajectories=trajectories, generator=generator
     )
@@ -129,6 +133,14 @@ def high_gaps(
     generator: np.random.Generator,
 ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, Tensor]]:
     """Roll P^H out from random starts and cut the rollouts into gaps.
+
+    Args:
+        high: P^H; no gradient reaches it.
+        data: embeddings [N, T, D] and actions [N, T].
+        h: control steps per gap.
+        horizon_steps: K_p, length of the rollouts in control steps.
+        trajectories: rollouts.
+        generator: of trajectories and starts.
 
     Returns:
         Left and right ends [G, D] (z̃ at a and a + h), actions [G, h] of steps a … a + h − 1, and

@@ -32,6 +32,9 @@ class InverseDynamics(nn.Module):
         Args:
             z, z_next: embeddings [N, D] a stride apart.
             action: [N] mean applied action of the stride, in units of the force limit.
+
+        Returns:
+            Scalar in (half the force limit)².
         """
         predicted = self.layers(torch.cat([z, z_next], dim=-1)).squeeze(-1)
         return F.mse_loss(predicted, 2.0 * action)

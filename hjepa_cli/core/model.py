@@ -46,21 +46,13 @@ def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
     return modules
 
 
-def load_modules(checkpoint: Checkpoint, kind: str) -> nn.ModuleDict:
+def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
     """Rebuild the networks of a checkpoint, with strict names, shapes and dtypes.
 
     Raises:
-        DataError: the checkpoint is of another kind or its tensors do not fit its architecture.
+        DataError: its tensors do not fit its architecture.
     """
-    architecture = checkpoint.metadata["architecture"]
-    if architecture["kind"] != kind:
-        stage = {"encoder": "train-encoder", "hierarchy": "train-hierarchy"}
-        raise DataError(
-            f"{checkpoint.path} is a checkpoint of {stage[architecture['kind']]}, "
-            f"not of {stage[kind]}",
-            hint=f"hjepa {stage[kind]}",
-        )
-    modules = build_modules(architecture)
+    modules = build_modules(checkpoint.metadata["architecture"])
     expected = {
         name: (str(tensor.numpy().dtype), tuple(tensor.shape))
         for name, tensor in modules.state_dict().items()
@@ -122,8 +114,12 @@ class Model:
             DataError: not an intact hierarchy checkpoint.
         """
         checkpoint = load_checkpoint(path)
-        modules = load_modules(checkpoint, "hierarchy")
-        return cls(modules, checkpoint.metadata, checkpoint.digest, device)
+        if checkpoint.metadata["architecture"]["kind"] != "hierarchy":
+            raise DataError(
+                f"{path} is a checkpoint of train-encoder, not of train-hierarchy",
+                hint=f"hjepa train-hierarchy --encoder {path}",
+            )
+        return cls(load_modules(checkpoint), checkpoint.metadata, checkpoint.digest, device)
 
     @property
     def methods(self) -> tuple[str, ...]:

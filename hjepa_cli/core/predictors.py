@@ -68,5 +68,6 @@ class Predictor(nn.Module):
             start = z + (anchor - z) / remaining
             if self.sees_distance:
                 inputs.append(torch.full_like(z[..., :1], 1.0 / remaining))
-        change: Tensor = self.output(torch.relu(self.hidden(torch.cat(inputs, dim=-1))))
+        # In float32 from here on: lengths and cosines of rollouts do not survive bfloat16.
+        change: Tensor = self.output(torch.relu(self.hidden(torch.cat(inputs, dim=-1)))).float()
         return normalise(start + change if self.residual else change)

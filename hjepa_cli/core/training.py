@@ -42,7 +42,7 @@ def _multiplies_bf16(device: torch.device) -> bool:
 def learning_rate_factor(step: int, steps: int, schedule: str) -> float:
     """Learning rate at ``step`` of ``steps`` ÷ its peak: ``constant``, or ``one-cycle`` in cosines.
 
-    A closed form of the step, so that a resumed run needs no scheduler state.
+    A closed form of the step: there is no scheduler state to keep.
     """
     if schedule == "constant":
         return 1.0
@@ -60,7 +60,7 @@ class Optimiser:
         name: ``adamw`` | ``sgd``.
         schedule: see :func:`learning_rate_factor`.
         steps: length of the schedule.
-        gradient_clip: largest gradient norm.
+        gradient_clip: largest gradient norm; 0 does not clip.
     """
 
     def __init__(
@@ -91,12 +91,13 @@ class Optimiser:
             group["lr"] = rate
         self.inner.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(self.parameters, self.gradient_clip)
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.gradient_clip or math.inf)
         if not torch.isfinite(norm) or not torch.isfinite(loss):
             raise NumericalError(
                 f"training diverged at step {step} (loss {loss.item():.4g}, "
                 f"gradient norm {norm.item():.4g}, learning rate {rate:.3g})",
-                hint="lower the learning rate or train with --config precision = 'fp32'",
+                hint="pass --config FILE.toml with a lower learning_rate, "
+                'or with precision = "fp32" in [encoder]',
             )
         self.inner.step()
 
@@ -109,20 +110,24 @@ def fit_actor(
     Args:
         z: embeddings [N, D].
         actions: teacher's labels [N] in units of the force limit.
-        epochs: fewer than ``settings.epochs`` for a quick probe.
+        epochs: passes over z, ``settings.epochs`` by default.
+
+    Returns:
+        The actor in evaluation mode, on the device of ``z``.
     """
     torch.manual_seed(seed)
+    actions = actions.to(z.device)
     actor = Actor(z.shape[1], settings.hidden, settings.dropout).to(z.device)
     batches = max(len(z) // settings.batch, 1)
     total = batches * (epochs or settings.epochs)
     optimiser = Optimiser(
         actor.parameters(),
         name="adamw",
-        schedule="one-cycle",
+        schedule=settings.schedule,
         steps=total,
         learning_rate=settings.learning_rate,
         weight_decay=settings.weight_decay,
-        gradient_clip=1.0,
+        gradient_clip=settings.gradient_clip,
     )
     actor.train()
     order = torch.empty(0, dtype=torch.long)

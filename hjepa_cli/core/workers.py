@@ -87,6 +87,8 @@ class Workers:
         for worker in self._workers:
             worker.kill()
         self._threads.shutdown(cancel_futures=True)
+        for worker in self._workers:
+            worker.close()
 
 
 class _Worker:
@@ -120,7 +122,11 @@ class _Worker:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.wait()
+
+    def close(self) -> None:
+        """Give the pipes back and reap the process, once nobody reads from it any more."""
+        with contextlib.suppress(BrokenPipeError):
+            self._process.__exit__(None, None, None)
 
     def _send(self, message: bytes) -> None:
         assert self._process.stdin is not None

@@ -2,18 +2,20 @@
 
 import dataclasses
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hjepa_cli import __version__
 from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.model import encode_frames
 from hjepa_cli.core.plant import plant
-from hjepa_cli.errors import MissingInputError
+from hjepa_cli.core.training import resolve_device
+from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage.datasets import (
@@ -24,7 +26,7 @@ from hjepa_cli.storage.datasets import (
 )
 from hjepa_cli.storage.runs import Run
 
-RENDER_CHUNK = 20  # trajectories per call, so that progress shows
+CHUNK = 20  # trajectories rendered or encoded at a time: progress shows, memory stays small
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +68,41 @@ class RenderedSplit:
         return self.labels[:, ::every].flatten()
 
 
+def embed(
+    encoder: nn.Module,
+    split: RenderedSplit,
+    settings: Settings,
+    *,
+    every: int = 1,
+    mirrored: bool = False,
+    advance: Callable[[int], None] = lambda count: None,
+) -> Tensor:
+    """Frozen embeddings [N, K, D] of frames k = 0, ``every``, … or of their mirror images."""
+    device = resolve_device(settings.device)
+    precision = settings.encoder.precision
+    parts = []
+    for start in range(0, len(split.frames), CHUNK):
+        part = split.slice(start, start + CHUNK)
+        pairs = part.pairs(every, mirrored=mirrored)
+        z = encode_frames(encoder, pairs, device=device, precision=precision)
+        parts.append(z.unflatten(0, (len(part.frames), -1)))
+        advance(len(part.frames))
+    return torch.cat(parts)
+
+
+def check_stride(h: int, steps: int) -> None:
+    """Refuse strides that do not fit into the trajectories.
+
+    Raises:
+        UsageError: naming the longest that does.
+    """
+    if h >= steps:
+        raise UsageError(
+            f"--h {h}: the dataset's trajectories have {steps} steps; choose --h below {steps}",
+            hint=f"hjepa collect --steps {2 * h}, or a smaller --h",
+        )
+
+
 def open_dataset(path: Path | None, settings: Settings) -> Dataset:
     """The dataset at ``path``, or the newest one of the settings' plant below ``data/``.
 
@@ -91,8 +128,8 @@ def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> Rende
         count = len(trajectories)
         parts = []
         with screen.progress("render", count, "trajectories") as bar:
-            for start in range(0, count, RENDER_CHUNK):
-                chunk = trajectories.states[start : start + RENDER_CHUNK]
+            for start in range(0, count, CHUNK):
+                chunk = trajectories.states[start : start + CHUNK]
                 images = camera.render(chunk.reshape(-1, 4))
                 parts.append(images.reshape(*chunk.shape[:2], *images.shape[1:]))
                 bar.advance(len(chunk))

@@ -5,6 +5,7 @@ sub-sampled trajectories, look at the representation's health every epoch, and l
 decide whether the result is worth handing on.
 """
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -17,18 +18,27 @@ from hjepa_cli.core import health
 from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.jepa import Jepa
-from hjepa_cli.core.model import build_modules, encode_frames, tensors_of
+from hjepa_cli.core.model import build_modules, tensors_of
 from hjepa_cli.core.predictors import Predictor
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import EncoderSettings, Settings
-from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, training_run, versions
+from hjepa_cli.stages.inputs import (
+    RenderedSplit,
+    check_stride,
+    embed,
+    open_dataset,
+    render,
+    training_run,
+    versions,
+)
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 from hjepa_cli.storage.runs import Run
 
 STREAM = 2  # this stage's branch of the seed tree
+REJECTED_FILE = "rejected.safetensors"  # what did not pass the gates: nothing trained is lost
 PROBE_EPOCHS = 20  # of the quick probe actor that watches training
 
 
@@ -43,6 +53,7 @@ def run(
     """
     data = open_dataset(dataset, settings)
     recorded = {split: data.split(split) for split in ("train", "test")}
+    check_stride(settings.encoder.h, recorded["train"].steps)
     with training_run("train-encoder", out, settings, screen) as record:
         if record.result is not None:
             return record.result
@@ -59,23 +70,23 @@ def run(
         screen.say("measuring health on all frames and fitting the probe actor")
         report = examine(encoder, companion, train, test, settings, every=1, epochs=None)
         gates = judge(report, settings.encoder)
-        path = record.path(MODEL_FILE)
-        if all(gate["passed"] for gate in gates.values()) or not settings.encoder.gate:
-            metadata = {
-                "stage": "train-encoder",
-                "plant": settings.plant,
-                "architecture": architecture,
-                "settings": settings.as_dict(),
-                "dataset": data.digest,
-                "camera": data.camera,
-                "seed": settings.seed,
-                "versions": versions(),
-                "health": report,
-            }
-            save_checkpoint(path, tensors_of(modules), metadata)
+        accepted = all(gate["passed"] for gate in gates.values()) or not settings.encoder.gate
+        path = record.path(MODEL_FILE if accepted else REJECTED_FILE)
+        metadata = {
+            "stage": "train-encoder",
+            "plant": settings.plant,
+            "architecture": architecture,
+            "settings": settings.as_dict(),
+            "dataset": data.digest,
+            "camera": data.camera,
+            "seed": settings.seed,
+            "versions": versions(),
+            "health": report,
+        }
+        save_checkpoint(path, tensors_of(modules), metadata)
         show_gates(screen, gates)
-        if settings.encoder.gate:
-            enforce(gates)
+        if not accepted:
+            refuse(gates, path)
         result = {
             "checkpoint": str(path),
             "seconds": round(time.perf_counter() - started, 2),
@@ -155,7 +166,9 @@ def train_jepa(
             jepa.update_target()
             bar.advance(1, loss=loss.item())
             if (step + 1) % epoch_steps == 0:
-                report = examine(encoder, companion, train, test, settings, every=4)
+                report = examine(
+                    encoder, companion, train, test, settings, every=math.gcd(4, options.h)
+                )
                 losses = {f"loss_{name}": term.item() for name, term in terms.items()}
                 record.metric({"step": step + 1, **losses, **flatten(report)})
     encoder.eval()
@@ -173,25 +186,23 @@ def examine(
 ) -> dict[str, Any]:
     """Health of frozen embeddings (spec §3), from every ``every``-th frame of both splits.
 
+    ``every`` divides h, so that the embeddings a stride apart are among them.
     ``epochs`` limits the probe actor's fit; ``None`` fits it in full, on mirrored frames too when
     training is mirrored.
     """
     options, device = settings.encoder, resolve_device(settings.device)
     encoder.eval()
 
-    def embed(split: RenderedSplit, *, mirrored: bool = False) -> Tensor:
-        pairs = split.pairs(every, mirrored=mirrored)
-        return encode_frames(encoder, pairs, device=device, precision=options.precision)
-
-    train_z, test_z = embed(train), embed(test)
+    train_z, test_z = (embed(encoder, split, settings, every=every) for split in (train, test))
+    per_trajectory, train_z, test_z = test_z, train_z.flatten(0, 1), test_z.flatten(0, 1)
     train_states, test_states = train.states_at(every), test.states_at(every)
     fit_z, fit_labels = train_z, train.labels_at(every)
     if epochs is None and options.mirror:
-        fit_z = torch.cat([fit_z, embed(train, mirrored=True)])
+        mirrored = embed(encoder, train, settings, every=every, mirrored=True)
+        fit_z = torch.cat([fit_z, mirrored.flatten(0, 1)])
         fit_labels = torch.cat([fit_labels, -fit_labels])
     actor = fit_actor(fit_z, fit_labels, settings.actor, seed=settings.seed, epochs=epochs)
-    per_trajectory = test_z.unflatten(0, (len(test.frames), -1))
-    ahead = options.h // every if options.h % every == 0 else 1
+    ahead = options.h // every
     start, end = per_trajectory[:, :-ahead].flatten(0, 1), per_trajectory[:, ahead:].flatten(0, 1)
     with torch.no_grad():
         sensitivity = health.action_sensitivity(companion.cpu().eval(), start, end, steps=options.h)
@@ -239,18 +250,18 @@ def show_gates(screen: Screen, gates: dict[str, dict[str, Any]]) -> None:
     screen.table("health, held out", ["measure", "value", "gate", ""], rows)
 
 
-def enforce(gates: dict[str, dict[str, Any]]) -> None:
+def refuse(gates: dict[str, dict[str, Any]], path: Path) -> None:
     """Stop the pipeline at a representation that cannot carry control."""
     failed = [
         f"{name} {gate['value']:.3f} (gate {gate['threshold']:g})"
         for name, gate in gates.items()
         if not gate["passed"]
     ]
-    if failed:
-        raise NumericalError(
-            f"the encoder failed its gate: {', '.join(failed)}",
-            hint="collect more trajectories, train longer (--steps), or keep it with --no-gate",
-        )
+    raise NumericalError(
+        f"the encoder failed its gate: {', '.join(failed)}",
+        hint="collect more trajectories or train for more steps; --no-gate skips the gate, and "
+        f"hjepa train-hierarchy --encoder {path} goes on with this one",
+    )
 
 
 def flatten(report: dict[str, Any]) -> dict[str, float]:

@@ -4,36 +4,46 @@ Dataset + encoder checkpoint → one checkpoint with everything inference needs.
 frozen: every frame is encoded once, and all that follows are small networks on embeddings.
 """
 
+import copy
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from numpy.random import Generator
 from torch import Tensor, nn
 
-from hjepa_cli.core import levels
+from hjepa_cli.core import health, levels
 from hjepa_cli.core.bench import control_errors
-from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.hierarchy import Strides
 from hjepa_cli.core.levels import EmbeddedTrajectories
 from hjepa_cli.core.methods import embedding_method
 from hjepa_cli.core.metrics import window_means
-from hjepa_cli.core.model import Model, build_modules, encode_frames, load_modules, tensors_of
+from hjepa_cli.core.model import Model, build_modules, load_modules, tensors_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.inputs import RenderedSplit, open_dataset, render, training_run, versions
+from hjepa_cli.stages.inputs import (
+    RenderedSplit,
+    check_stride,
+    embed,
+    open_dataset,
+    render,
+    training_run,
+    versions,
+)
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
 from hjepa_cli.storage.datasets import Dataset
 from hjepa_cli.storage.runs import Run, newest_run, read_config
-from hjepa_cli.storage.zoo import resolve_model
+from hjepa_cli.storage.zoo import find_model, resolve_model
 
 STREAM = 3  # this stage's branch of the seed tree
 REPORT_EVERY = 50  # steps between rows of metrics.csv
+ARCHITECTURE = ("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual")
 
 
 def run(
@@ -54,8 +64,10 @@ def run(
     """
     strides = Strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
     data = open_dataset(dataset, settings)
-    recorded = data.split("train")
-    source = open_encoder(encoder, settings)
+    recorded = {split: data.split(split) for split in ("train", "test")}
+    check_stride(strides.h, recorded["train"].steps)
+    source = open_encoder(encoder, settings, screen)
+    trained = load_modules(source)
     with training_run("train-hierarchy", out, settings, screen) as record:
         if record.result is not None:
             return record.result
@@ -64,17 +76,23 @@ def run(
         screen.say(f"dataset {data.path}, encoder {source.path}, run {record.directory}")
         architecture = describe_architecture(source, settings)
         modules = build_modules(architecture)
-        copy_encoder(source, modules, strides)
+        modules["encoder"].load_state_dict(trained["encoder"].state_dict())
+        modules["encoder"].requires_grad_(False).eval()
+        if source.metadata["architecture"]["h"] == strides.h:
+            modules["high"].load_state_dict(trained["high"].state_dict())
         modules.to(resolve_device(settings.device))
 
-        train = render(recorded, settings.plant, screen)
-        plain, mirrored = embed(modules["encoder"], train, settings, screen)
-        labels = train.labels.flatten()
+        train, test = (render(split, settings.plant, screen) for split in recorded.values())
+        seen = embed_all(modules["encoder"], train, settings, screen)
         screen.say("fitting the semantic actor")
-        z_all = torch.cat([plain.z.flatten(0, 1), mirrored.z.flatten(0, 1)])
-        actor = fit_actor(z_all, torch.cat([labels, -labels]), settings.actor, seed=settings.seed)
+        actor = fit_actor(
+            torch.cat([data.z.flatten(0, 1) for data, _ in seen]),
+            torch.cat([labels.flatten() for _, labels in seen]),
+            settings.actor,
+            seed=settings.seed,
+        )
         modules["actor"].load_state_dict(actor.state_dict())
-        train_levels(modules, plain, mirrored, strides, settings, record, screen)
+        train_levels(modules, [data for data, _ in seen], strides, settings, record, screen)
 
         metadata = {
             "stage": "train-hierarchy",
@@ -86,7 +104,7 @@ def run(
             "camera": data.camera,
             "seed": settings.seed,
             "versions": versions(),
-            "health": source.metadata["health"],
+            "health": source.metadata["health"] | examine(modules, test, strides.h, settings),
         }
         path = record.path(MODEL_FILE)
         digest = save_checkpoint(path, tensors_of(modules), metadata)
@@ -102,23 +120,33 @@ def run(
         return result
 
 
-def open_encoder(name: str | None, settings: Settings) -> Checkpoint:
-    """The encoder checkpoint at a path, or the newest finished ``train-encoder`` run that fits.
+def open_encoder(name: str | None, settings: Settings, screen: Screen) -> Checkpoint:
+    """The encoder to build on: what ``--encoder`` names, or the newest run that fits, or the zoo's.
+
+    A run fits if its plant and architecture are those of the settings. A checkpoint that is named
+    brings its own architecture; any hierarchy checkpoint holds an encoder too.
 
     Raises:
         MissingInputError: none there.
         DataError: trained on another plant.
     """
     if name is None:
-        directory = newest_run(
-            "train-encoder", lambda run: read_config(run)["plant"] == settings.plant
-        )
-        if directory is None:
+        wanted = (settings.plant, described(settings.as_dict()["encoder"]))
+
+        def fits(run: Path) -> bool:
+            config = read_config(run)
+            return (config["plant"], described(config["encoder"])) == wanted
+
+        found = newest_run("train-encoder", fits) or find_model(settings.plant)
+        if found is None:
             raise MissingInputError(
-                f"no finished train-encoder run of plant {settings.plant} below runs/",
+                f"no finished train-encoder run of plant {settings.plant} and these settings "
+                "below runs/, and none in the zoo",
                 hint="hjepa train-encoder, or pass --encoder PATH",
             )
-        name = str(directory)
+        if found.is_file():
+            screen.say(f"no train-encoder run here that fits: encoder of the zoo, {found}")
+        name = str(found)
     checkpoint = load_checkpoint(resolve_model(name))
     if checkpoint.metadata["plant"] != settings.plant:
         raise DataError(
@@ -127,6 +155,11 @@ def open_encoder(name: str | None, settings: Settings) -> Checkpoint:
             hint=f"hjepa train-encoder --plant {settings.plant}",
         )
     return checkpoint
+
+
+def described(encoder: dict[str, Any]) -> dict[str, Any]:
+    """The settings of an encoder that its architecture records."""
+    return {name: encoder[name] for name in ARCHITECTURE}
 
 
 def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, Any]:
@@ -142,44 +175,38 @@ def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, A
     }
 
 
-def copy_encoder(source: Checkpoint, modules: nn.ModuleDict, strides: Strides) -> None:
-    """Take Ψ from the encoder checkpoint, and P^H from its companion where h agrees."""
-    trained = load_modules(source, "encoder")
-    modules["encoder"].load_state_dict(trained["encoder"].state_dict())
-    modules["encoder"].requires_grad_(False).eval()
-    if source.metadata["architecture"]["h"] == strides.h:
-        modules["high"].load_state_dict(trained["high"].state_dict())
-
-
-def embed(
+def embed_all(
     encoder: nn.Module, train: RenderedSplit, settings: Settings, screen: Screen
-) -> tuple[EmbeddedTrajectories, EmbeddedTrajectories]:
-    """Frozen embeddings of the training frames and of their mirror images."""
-    assert isinstance(encoder, Encoder)
+) -> list[tuple[EmbeddedTrajectories, Tensor]]:
+    """Frozen embeddings and labels [N, T] of the training frames; mirrored too where that is on."""
     device = resolve_device(settings.device)
-    count = len(train.frames)
-    embedded = []
-    with screen.progress("encode", 2 * count, "trajectories") as bar:
-        for sign in (1.0, -1.0):
-            parts = []
-            for start in range(0, count, 20):
-                part = train.slice(start, start + 20)
-                pairs = part.pairs(1, mirrored=sign < 0)
-                z = encode_frames(
-                    encoder, pairs, device=device, precision=settings.encoder.precision
-                )
-                parts.append(z.unflatten(0, (len(part.frames), -1)))
-                bar.advance(len(part.frames))
-            embedded.append(
-                EmbeddedTrajectories(torch.cat(parts).to(device), (sign * train.actions).to(device))
-            )
-    return embedded[0], embedded[1]
+    signs = (1.0, -1.0) if settings.encoder.mirror else (1.0,)
+    seen = []
+    with screen.progress("encode", len(signs) * len(train.frames), "trajectories") as bar:
+        for sign in signs:
+            z = embed(encoder, train, settings, mirrored=sign < 0, advance=bar.advance)
+            data = EmbeddedTrajectories(z.to(device), (sign * train.actions).to(device))
+            seen.append((data, sign * train.labels))
+    return seen
+
+
+@torch.inference_mode()
+def examine(
+    modules: nn.ModuleDict, test: RenderedSplit, h: int, settings: Settings
+) -> dict[str, float]:
+    """Held-out health of what this stage trained: the actor's error and P^H's sensitivity."""
+    z = embed(modules["encoder"], test, settings)
+    actor, high = copy.deepcopy(modules["actor"]).cpu(), copy.deepcopy(modules["high"]).cpu()
+    start, end = z[:, :-h].flatten(0, 1), z[:, h:].flatten(0, 1)
+    return {
+        "actor_nrmse": health.nrmse(actor.act(z), test.labels),
+        "action_sensitivity": health.action_sensitivity(high, start, end, steps=h),
+    }
 
 
 def train_levels(
     modules: nn.ModuleDict,
-    plain: EmbeddedTrajectories,
-    mirrored: EmbeddedTrajectories,
+    seen: list[EmbeddedTrajectories],
     strides: Strides,
     settings: Settings,
     record: Run,
@@ -188,20 +215,18 @@ def train_levels(
     """Train P^H, P^M, P^L and the flat baseline, in that order: each level builds on the last."""
     options = settings.hierarchy
     h, m, l = strides.h, strides.m, strides.l
-    coarse_data = join(plain, mirrored)
-    fine_data = join(
-        plain.first(options.fine_trajectories), mirrored.first(options.fine_trajectories)
-    )
-    stream = generator(settings.seed, STREAM)
+    coarse_data = join(seen)
+    fine_data = join([data.first(options.fine_trajectories) for data in seen])
     device = resolve_device(settings.device)
     high, medium, low, flat = (modules[name] for name in ("high", "medium", "low", "flat"))
     common = {
         "horizon_steps": options.rollout_steps,
         "trajectories": options.batch_trajectories,
-        "generator": stream,
     }
 
-    def fit(name: str, role: str, steps: int, loss: Callable[[], Tensor]) -> None:
+    def fit(name: str, role: str, steps: int, loss: Callable[[Generator], Tensor]) -> None:
+        # Every level has its own stream: what one does changes no other.
+        stream = generator(settings.seed, STREAM, list(modules).index(name))
         optimiser = Optimiser(
             modules[name].parameters(),
             name=options.optimizer,
@@ -215,24 +240,28 @@ def train_levels(
         with screen.progress(f"train {name}", steps, "steps") as bar:
             for step in range(steps):
                 with autocast(device, settings.encoder.precision):
-                    value = loss()
+                    value = loss(stream)
                 optimiser.step(value, step)
                 bar.advance(1, loss=value.item())
                 if (step + 1) % REPORT_EVERY == 0 or step + 1 == steps:
                     record.metric({"level": name, "step": step + 1, "loss": value.item()})
         modules[name].eval()
 
-    def high_loss() -> Tensor:
-        return levels.flat_loss(high, coarse_data, h, starts=options.coarse_starts, **common)
+    def high_loss(stream: Generator) -> Tensor:
+        return levels.flat_loss(
+            high, coarse_data, h, starts=options.coarse_starts, generator=stream, **common
+        )
 
-    def medium_loss() -> Tensor:
-        return levels.medium_loss(medium, high, fine_data, h, m, **common)
+    def medium_loss(stream: Generator) -> Tensor:
+        return levels.medium_loss(medium, high, fine_data, h, m, generator=stream, **common)
 
-    def low_loss() -> Tensor:
-        return levels.low_loss(low, medium, high, fine_data, h, m, l, **common)
+    def low_loss(stream: Generator) -> Tensor:
+        return levels.low_loss(low, medium, high, fine_data, h, m, l, generator=stream, **common)
 
-    def flat_loss() -> Tensor:
-        return levels.flat_loss(flat, coarse_data, 1, starts=options.flat_starts, **common)
+    def flat_loss(stream: Generator) -> Tensor:
+        return levels.flat_loss(
+            flat, coarse_data, 1, starts=options.flat_starts, generator=stream, **common
+        )
 
     fit("high", "coarse", options.coarse_steps, high_loss)
     if h > m:
@@ -242,10 +271,10 @@ def train_levels(
     fit("flat", "coarse", options.flat_steps, flat_loss)
 
 
-def join(plain: EmbeddedTrajectories, mirrored: EmbeddedTrajectories) -> EmbeddedTrajectories:
-    """Trajectories and their mirror images as one set."""
+def join(seen: list[EmbeddedTrajectories]) -> EmbeddedTrajectories:
+    """Trajectories and, if they are used, their mirror images as one set."""
     return EmbeddedTrajectories(
-        torch.cat([plain.z, mirrored.z]), torch.cat([plain.actions, mirrored.actions])
+        torch.cat([data.z for data in seen]), torch.cat([data.actions for data in seen])
     )
 
 

@@ -47,6 +47,14 @@ def list_models() -> list[str]:
     return [name for name in names if (root / name / MODEL_FILE).is_file()]
 
 
+def find_model(plant_name: str) -> Path | None:
+    """Return the checkpoint file of the zoo's first model of a plant, if there is one."""
+    for path in map(resolve_model, list_models()):
+        if load_checkpoint(path).metadata.get("plant") == plant_name:
+            return path
+    return None
+
+
 def resolve_model(name_or_path: str | Path) -> Path:
     """Return the checkpoint file of a zoo name, a run directory or a file.
 
