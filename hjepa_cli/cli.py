@@ -158,7 +158,9 @@ def _guard() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         raise Interrupted(
-            "interrupted", hint="the same command with --out and its run directory takes it up"
+            "interrupted",
+            hint="the same command with --out and its run directory takes it up; "
+            "a training stage starts over",
         ) from None
     except BrokenPipeError:
         raise PipeClosed("output closed") from None

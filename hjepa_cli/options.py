@@ -86,7 +86,7 @@ Out = Annotated[
     _plain(
         FILES,
         "--out",
-        "Directory to write to (new, empty, or an earlier run to continue). "
+        "Directory to write to (new, empty, or an earlier run to take up). "
         "Without it: the next free number below runs/ (collect: data/).",
         metavar="DIR",
     ),
