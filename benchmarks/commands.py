@@ -5,7 +5,8 @@
     python benchmarks/commands.py zoo        # scale from cached curves           (target ≤ 30 s)
     python benchmarks/commands.py remeasure  # scale --remeasure, one pixel method (target ≤ 5 min)
 
-Prints wall-clock seconds per command and in total. One run: quote it with the machine.
+Prints wall-clock seconds per command and in total. One run: quote it with the machine. A command
+that fails ends the benchmark with its exit code and the last lines it wrote to standard error.
 """
 
 import argparse
@@ -19,6 +20,7 @@ import time
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+LAST_LINES = 10  # of standard error, shown when a command fails
 LINES = (
     "collect --trajectories 200",
     "train-encoder",
@@ -45,15 +47,20 @@ def main() -> None:
         for line in SUITES[suite]:
             words = shlex.split(line) + (["--preset", "smoke"] if suite == "smoke" else [])
             started = time.perf_counter()
-            subprocess.run(
+            ended = subprocess.run(
                 [sys.executable, "-m", "hjepa_cli", *words],
                 cwd=directory,
                 env=environment,
-                check=True,
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
             )
             seconds = time.perf_counter() - started
+            if ended.returncode:
+                print(f"failed after {seconds:.1f} s: hjepa {' '.join(words)}", file=sys.stderr)
+                print(*ended.stderr.splitlines()[-LAST_LINES:], sep="\n", file=sys.stderr)
+                sys.exit(ended.returncode)
             total += seconds
             print(f"{seconds:8.1f} s  hjepa {' '.join(words)}", flush=True)
     print(f"{total:8.1f} s  in all")

@@ -3,6 +3,8 @@
 import dataclasses
 import io
 import json
+import multiprocessing
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from hjepa_cli.core import workers as workers_module
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.methods import (
@@ -448,14 +451,29 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
         )
 
 
-def test_a_dead_worker_is_reported_and_none_is_left_behind(checkpoint: Path) -> None:
+def test_a_dead_worker_is_reported_and_none_is_left_behind() -> None:
+    points = [Point("gap", 3.0)]
     with Workers(small(steps=8), None, 2) as workers:
-        processes = [worker._process for worker in workers._workers]
+        run_points(workers, "oracle", points, 4, lambda steps: None)
+        processes = multiprocessing.active_children()
+        assert len(processes) == 2
         for process in processes:
             process.kill()
-        with pytest.raises(NumericalError, match="a worker process ended with code -9"):
-            run_points(workers, "oracle", [Point("gap", 3.0)], 4, lambda steps: None)
-    assert [process.poll() for process in processes] == [-9, -9]
+        with pytest.raises(NumericalError, match="a worker process died"):
+            run_points(workers, "oracle", points, 4, lambda steps: None)
+    assert not multiprocessing.active_children()
+
+
+def test_an_interrupt_ends_the_workers_at_once() -> None:
+    started = time.monotonic()
+    with (
+        pytest.raises(KeyboardInterrupt),
+        Workers(small(steps=1_000_000), None, 1) as workers,
+    ):
+        workers._pool.submit(workers_module._simulate, Block("oracle", (Point("gap", 3.0),), 0, 1))
+        raise KeyboardInterrupt
+    assert not multiprocessing.active_children()
+    assert time.monotonic() - started < 30
 
 
 def test_eval_uses_workers_where_they_are_worth_it(
