@@ -26,7 +26,7 @@ from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage import curves, runs, zoo
-from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
+from hjepa_cli.storage.checkpoints import MODEL_FILE
 from hjepa_cli.storage.curves import Digest, Entry
 from hjepa_cli.storage.datasets import Dataset, load_dataset
 from hjepa_cli.storage.runs import Run
@@ -345,11 +345,10 @@ def _default_model(settings: Settings, screen: Screen) -> Path | None:
     if directory:
         screen.say(f"model of the newest run, {directory}")
         return directory / MODEL_FILE
-    for name in zoo.list_models():
-        path = zoo.resolve_model(name)
-        if load_checkpoint(path).metadata["plant"] == settings.plant:
-            screen.say(f"no run of train-hierarchy here: model {name} of the zoo")
-            return path
+    path = zoo.find_model(settings.plant)
+    if path:
+        screen.say(f"no run of train-hierarchy here: model {path.parent.name} of the zoo")
+        return path
     screen.say(f"no model of plant {settings.plant}: true-state methods only")
     return None
 
