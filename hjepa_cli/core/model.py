@@ -1,6 +1,7 @@
 """A trained model: encoder, predictors and actor in one object, as a checkpoint holds them."""
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +138,8 @@ class Model:
 
     def actor(self, z: Tensor) -> Tensor:
         """Embeddings [N, D] → forces_n [N], clipped to the force limit."""
-        return self.force_limit_n * self._act(z)
+        with self.autocast():
+            return self.force_limit_n * self._act(z)
 
     def planner(self, method: str) -> Planner:
         """The planner behind ``method``.
@@ -151,8 +153,12 @@ class Model:
             )
         return self._planners[method]
 
+    def autocast(self) -> AbstractContextManager[object]:
+        """The precision that the networks were trained in."""
+        return autocast(self.device, self.precision)
+
     def _act(self, z: Tensor) -> Tensor:
-        return self.modules["actor"].act(z)  # type: ignore[no-any-return, operator]
+        return self.modules["actor"].act(z).float()  # type: ignore[no-any-return, operator]
 
 
 class _Hierarchical:
@@ -164,15 +170,16 @@ class _Hierarchical:
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
         modules = self._model.modules
-        actions, _, z_next = plan_stride(
-            self._model._act,
-            modules["high"],
-            modules["medium"],
-            modules["low"],
-            z,
-            self._model.strides,
-            recompute_anchor=self._model.architecture["stride_actions"] == "all",
-        )
+        with self._model.autocast():
+            actions, _, z_next = plan_stride(
+                self._model._act,
+                modules["high"],
+                modules["medium"],
+                modules["low"],
+                z,
+                self._model.strides,
+                recompute_anchor=self._model.architecture["stride_actions"] == "all",
+            )
         return self._model.force_limit_n * actions, z_next
 
 
@@ -183,5 +190,6 @@ class _Flat:
         self._model, self._predictor, self.stride = model, model.modules[name], stride
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        actions = hold(self._model._act(z), self.stride)
-        return self._model.force_limit_n * actions, self._predictor(z, actions)
+        with self._model.autocast():
+            actions = hold(self._model._act(z), self.stride)
+            return self._model.force_limit_n * actions, self._predictor(z, actions)

@@ -15,7 +15,7 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.settings import Settings
 
-BLOCK_DEVICES = 64
+BLOCK_DEVICES = 128
 
 
 @dataclasses.dataclass(frozen=True)
