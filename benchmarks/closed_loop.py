@@ -17,17 +17,12 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from hjepa_cli.core.bench import Bench
 from hjepa_cli.core.camera import Camera
-from hjepa_cli.core.methods import (
-    TRUE_STATE,
-    embedding_method,
-    one_core_per_thread,
-    true_state_method,
-)
+from hjepa_cli.core.methods import TRUE_STATE
 from hjepa_cli.core.model import Model, build_modules
 from hjepa_cli.core.plant import CartPoles, plant
 from hjepa_cli.core.protocol import Point
+from hjepa_cli.core.simulator import Simulator, run_points
 from hjepa_cli.errors import HjepaError
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages.train_encoder import describe_architecture
@@ -74,25 +69,20 @@ def pieces(model: Model, devices: int) -> None:
 
 
 def loops(model: Model, settings: Settings, devices: int, steps: int) -> None:
-    """The whole loop at a few gaps, as ``eval`` runs it."""
+    """The whole loop at a few gaps, in this one process (``eval`` uses one per core)."""
     kind = plant(model.plant_name)
     protocol = dataclasses.replace(
         settings.protocol, steps=steps, curve_devices=devices, bracket_devices=devices
     )
-    bench = Bench(kind, protocol, 0)
+    simulator = Simulator(dataclasses.replace(settings, protocol=protocol), model)
     print(
         f"real-time factor of {devices} devices together, {steps} steps of {kind.step_s * 1e3:g} ms"
     )
     for name in (*model.methods, *(method for method in TRUE_STATE if method != "optimal")):
-        if name in TRUE_STATE:
-            method = true_state_method(name, kind, 0)
-        else:
-            method = embedding_method(name, model, protocol.payload_bits_per_value)
         factors = []
         for gap in (1.0, 20.0, 80.0):
             started = time.perf_counter()
-            with one_core_per_thread():
-                bench.measure(method, [Point("gap", gap)], devices)
+            run_points(simulator, name, [Point("gap", gap)], devices, lambda steps: None)
             took_s = time.perf_counter() - started
             factors.append(f"{devices * steps * kind.step_s / took_s:9.1f} x at D = {gap:g}")
         print(f"{name:9} " + ", ".join(factors))
