@@ -12,7 +12,7 @@ ARGS ?=
 
 demo:
 	@scripts/venv plot
-	.venv/bin/hjepa scale --snr 10:30 $(ARGS)
+	.venv/bin/hjepa scale --snr 10:30 --checkpoint desktop-h4m2l1 $(ARGS)
 
 test:
 	@scripts/venv test

@@ -34,6 +34,8 @@ METHODS = (
 )
 
 LARGEST_SEED = 2**63 - 1
+LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
+LARGEST_STRIDE = 10_000
 ZERO_ALLOWED = ("seed",)  # counts that may be 0; all others start at 1
 NEGATIVE_ALLOWED = ("encoder.gate_",)  # an R² threshold may be negative
 POSITIVE = ("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket")
@@ -53,8 +55,18 @@ def check_settings(settings: Settings) -> None:
     check_strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
     check_methods(settings.methods)
     gaps = settings.protocol.gaps
-    if not gaps or list(gaps) != sorted(set(gaps)):
-        raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps, at least one")
+    if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
+        raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on")
+    bits = settings.protocol.payload_bits_per_value
+    if not 2 <= bits <= 16:
+        raise UsageError(f"protocol.payload_bits_per_value = {bits}; expected 2 to 16")
+    if settings.collect.steps < 2:
+        raise UsageError(f"collect.steps = {settings.collect.steps}; expected at least 2")
+    if settings.radio.bandwidth_hz > LARGEST_BANDWIDTH_HZ:
+        raise UsageError(
+            f"radio.bandwidth_hz = {settings.radio.bandwidth_hz:g}; "
+            f"expected at most {LARGEST_BANDWIDTH_HZ:g}"
+        )
 
 
 def check_strides(h: int, m: int, l: int) -> None:
@@ -63,8 +75,8 @@ def check_strides(h: int, m: int, l: int) -> None:
     Raises:
         UsageError: naming the strides that would do.
     """
-    if h < 1:
-        raise UsageError(f"--h {h}; expected at least 1")
+    if not 1 <= h <= LARGEST_STRIDE:
+        raise UsageError(f"--h {h}; expected 1 to {LARGEST_STRIDE}")
     fitting_m = _largest_divisor(h, m)
     fitting_l = _largest_divisor(fitting_m, l)
     hint = f"hjepa train-hierarchy --h {h} --m {fitting_m} --l {fitting_l}"

@@ -24,7 +24,7 @@ PRESETS = ("default", "paper", "gym", "smoke")
 
 @dataclasses.dataclass(frozen=True)
 class CollectSettings:
-    """``collect``: how the dataset is made (spec §2)."""
+    """``collect``: how the dataset is made."""
 
     trajectories: int
     test_trajectories: int
@@ -42,7 +42,7 @@ class CollectSettings:
 
 @dataclasses.dataclass(frozen=True)
 class EncoderSettings:
-    """``train-encoder``: the JEPA with its companion P^H, then the probe actor (spec §3)."""
+    """``train-encoder``: the JEPA with its companion P^H, then the probe actor."""
 
     embedding: int
     hidden: int
@@ -76,7 +76,7 @@ class EncoderSettings:
 
 @dataclasses.dataclass(frozen=True)
 class ActorSettings:
-    """The semantic actor, fitted by both training stages (spec §3)."""
+    """The semantic actor, fitted by both training stages."""
 
     hidden: int
     dropout: float
@@ -90,7 +90,7 @@ class ActorSettings:
 
 @dataclasses.dataclass(frozen=True)
 class HierarchySettings:
-    """``train-hierarchy``: P^H, P^M, P^L and ts-jepa-1 on frozen embeddings (spec §3)."""
+    """``train-hierarchy``: P^H, P^M, P^L and ts-jepa-1 on frozen embeddings."""
 
     h: int
     m: int
@@ -117,7 +117,7 @@ class HierarchySettings:
 
 @dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
-    """``eval`` and ``scale``: the closed-loop protocol (spec §4)."""
+    """``eval`` and ``scale``: the closed-loop protocol."""
 
     steps: int
     curve_devices: int
@@ -141,7 +141,7 @@ class ProtocolSettings:
 
 @dataclasses.dataclass(frozen=True)
 class RadioSettings:
-    """``scale``: the radio cell (spec §5)."""
+    """``scale``: the radio cell."""
 
     law: Literal["duty", "equal"]
     snr_db: str

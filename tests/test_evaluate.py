@@ -4,6 +4,9 @@ import dataclasses
 import io
 import json
 import multiprocessing
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -476,6 +479,37 @@ def test_an_interrupt_ends_the_workers_at_once() -> None:
     assert time.monotonic() - started < 30
 
 
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import dataclasses, multiprocessing, os, signal\n"
+        "from hjepa_cli.core import workers\n"
+        "from hjepa_cli.core.protocol import Point\n"
+        "from hjepa_cli.core.simulator import Block\n"
+        "from hjepa_cli.settings import load_settings\n"
+        "if __name__ == '__main__':\n"
+        "    settings = load_settings(flags={'protocol.bracket_devices': 64})\n"
+        "    pool = workers.Workers(settings, None, 1)\n"
+        "    block = Block('hold-true', (Point('gap', 3.0),), 0, 64)\n"
+        "    pool._pool.submit(workers._simulate, block)\n"
+        "    print(multiprocessing.active_children()[0].pid, flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    repository = str(Path(__file__).parents[1])
+    run = subprocess.run(
+        [sys.executable, script],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=os.environ | {"PYTHONPATH": repository},
+    )
+    worker = int(run.stdout)
+    deadline = time.monotonic() + 30
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{worker}").exists()
+
+
 def test_eval_uses_workers_where_they_are_worth_it(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -598,7 +632,7 @@ def test_oracle_and_optimal_make_no_error_on_clean_rollouts() -> None:
     ("preset", "expected"),
     [
         # Measured once with an independent implementation on other draws, 256 devices: score at
-        # gaps (spec §4's protocol), and the teacher's own score.
+        # gaps, and the teacher's own score.
         (
             "default",
             {

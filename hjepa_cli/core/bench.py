@@ -70,7 +70,7 @@ class Bench:
         )
 
     def entry(self, method: Method) -> dict[str, Any]:
-        """What ``eval --json`` prints about a method's closed loop (spec §8)."""
+        """What ``eval --json`` prints about a method's closed loop."""
         if not method.uses_link:
             return _flat_entry(self.protocol)
         curves = self.curves(method)
@@ -148,7 +148,7 @@ def control_errors(
 
 
 def control_entry(errors: Floats, replicates: int, seed: int) -> dict[str, Any]:
-    """What ``eval --json`` prints about a method's control error [R, horizon + 1] (spec §8)."""
+    """What ``eval --json`` prints about a method's control error [R, horizon + 1]."""
     weights = metrics.bootstrap_weights(len(errors), replicates, seed)
     windows = metrics.window_means(errors)
     return {

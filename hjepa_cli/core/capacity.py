@@ -1,4 +1,4 @@
-"""How many control loops one radio cell supports: the laws ``duty`` and ``equal`` (spec §5).
+"""How many control loops one radio cell supports: the laws ``duty`` and ``equal``.
 
 Both turn one property of a closed loop into a number of devices that share W hertz, in slots of one
 control step τ_o, when a packet has b bits and the SNR is γ̄:
@@ -46,7 +46,7 @@ def late_slots(packets_per_slot: npt.ArrayLike) -> FloatArray:
     """Return how many slots late a packet arrives: 1/c where a slot carries c < 1 of it, else 0.
 
     A packet that fits into its slot counts as delivered in it; a raw camera frame may need several
-    slots of the whole band, and by then it is that old (spec §4).
+    slots of the whole band, and by then it is that old.
     """
     c = _positive("packets per slot", packets_per_slot, "")
     return np.asarray(np.where(c < 1.0, 1.0 / c, 0.0))[()]

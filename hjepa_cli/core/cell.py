@@ -1,6 +1,6 @@
 """One radio cell full of control loops: what a loop needs of the link, and how many the cell fits.
 
-Joins a method's measured tolerance (spec §4) with a law of :mod:`hjepa_cli.core.capacity` and puts
+Joins a method's measured tolerance with a law of :mod:`hjepa_cli.core.capacity` and puts
 the count beside the bits that control needs in theory. The rows are those of ``scale --json``.
 """
 

@@ -1,4 +1,4 @@
-"""The context encoder Ψ: two camera frames in, one embedding out (paper §III-A, spec §3).
+"""The context encoder Ψ: two camera frames in, one embedding out (paper §III-A).
 
 A residual network with three stages of 64, 128 and 256 channels keeps a 4 × 8 map to its last
 layer, because a cart-pole is where things are: global average pooling would throw the positions

@@ -1,4 +1,4 @@
-"""The hierarchy of predictors: how strides nest, in training and in the closed loop (spec §3).
+"""The hierarchy of predictors: how strides nest, in training and in the closed loop.
 
 Notation: a packet at step k restarts all grids at k. Coarse anchors lie at a = k, k + h, …; the
 medium level fills a + m, a + 2m, … inside each gap, the low level l, 2l, … inside each m-step.

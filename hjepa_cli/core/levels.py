@@ -1,5 +1,5 @@
 """Training the levels of the hierarchy on frozen embeddings: P^H and flat predictors by rollouts,
-P^M and P^L by filling the gaps between P^H's own predictions (spec §3)."""
+P^M and P^L by filling the gaps between P^H's own predictions."""
 
 import dataclasses
 

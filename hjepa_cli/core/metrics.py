@@ -1,4 +1,4 @@
-"""Every number of the closed loop: scores, costs, control error, intervals, tolerances (spec §4).
+"""Every number of the closed loop: scores, costs, control error, intervals, tolerances.
 
 Notation for shapes: N devices, P curve points, B bootstrap replicates. Intervals are percentile
 intervals of a bootstrap over devices; the same devices are drawn for a method and for its

@@ -1,4 +1,4 @@
-"""What one transmission carries: a quantised embedding, or raw camera frames (spec §4).
+"""What one transmission carries: a quantised embedding, or raw camera frames.
 
 An embedding travels as one small integer per value and one 16-bit scale per vector. The closed
 loop really quantises and dequantises, so the bits counted here are bits the controller lives on.

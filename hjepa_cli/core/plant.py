@@ -31,7 +31,7 @@ START = np.array([0.03, 0.1, 0.08, 0.5])  # m, m/s, rad, rad/s: where a seeded C
 
 @dataclasses.dataclass(frozen=True)
 class Plant:
-    """One kind of cart-pole with its teacher's weights and its camera's window (spec §2)."""
+    """One kind of cart-pole with its teacher's weights and its camera's window."""
 
     name: str
     cart_mass_kg: float

@@ -1,7 +1,7 @@
 """The measuring protocol: curves over the gap and over the delivery probability, and tolerances.
 
 A curve is measured on a grid with few devices; where it crosses the acceptable score it is
-measured again with more, until the crossing is bracketed to a few per cent (spec §4).
+measured again with more, until the crossing is bracketed to a few per cent.
 Both curves live on one axis, the mean gap g between packets in steps: D = g for the gap curve,
 p = 1/g for the delivery curve, whose crossing is interpolated in ln p instead of in D.
 """

@@ -1,4 +1,4 @@
-"""Trajectories for training: the teacher drives, exploration shows what a force does (spec §2)."""
+"""Trajectories for training: the teacher drives, exploration shows what a force does."""
 
 import numpy as np
 from numpy.typing import NDArray

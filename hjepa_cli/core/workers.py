@@ -6,6 +6,7 @@ A control step is many small operations on few devices, which threads do not spe
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -93,11 +94,19 @@ _simulator: Simulator | None = None
 
 
 def _start(settings: Settings, model_path: Path | None, done: "Synchronized[int]") -> None:
-    """Prepare a worker: one thread, and Ctrl-C is the parent's, which then ends it."""
+    """Prepare a worker: one thread; Ctrl-C is the parent's; it ends when the parent is gone."""
     global _settings, _model_path, _done
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     _settings, _model_path, _done = settings, model_path, done
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _simulate(block: Block) -> Outcome:

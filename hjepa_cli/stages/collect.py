@@ -41,7 +41,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             holds a finished dataset is left as it is and described again.
 
     Returns:
-        The document of spec §8 ``collect``; ``frames_per_s`` is null if nothing was rendered.
+        The document of ``--json``; ``frames_per_s`` is null if nothing was rendered.
 
     Raises:
         UsageError: a count that is too small, or ``out`` holds something else.
@@ -129,7 +129,7 @@ def film(
 
 
 def describe(data: Dataset, seconds: float, frames_per_s: float | None) -> dict[str, Any]:
-    """The document of spec §8; ``training_uplink_bits`` is what its frames would take to send."""
+    """The document of ``--json``; ``training_uplink_bits`` is what sending its frames would take."""
     count, steps = (data.splits["train"][key] for key in ("trajectories", "steps"))
     return {
         "dataset": str(data.path),

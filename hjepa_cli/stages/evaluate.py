@@ -32,7 +32,7 @@ from hjepa_cli.storage.datasets import Dataset, load_dataset
 from hjepa_cli.storage.runs import Run
 from hjepa_cli.storage.zoo import CURVES_FILE
 
-MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods (spec §4)
+MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods
 USUAL_ROUNDS = 5  # of the search for tolerances, for the progress bar
 WORTH_WORKERS = 50_000  # device-steps per point; below, processes cost more than they bring
 
@@ -100,7 +100,7 @@ def run(
     out: Path | None = None,
     remeasure: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate ``settings.methods``; returns the document of spec §8.
+    """Evaluate ``settings.methods``; returns the document of ``--json``.
 
     Args:
         settings: what to measure.
@@ -280,7 +280,7 @@ def _evaluate(
 def _measure(
     subject: Subject, screen: Screen, methods: Sequence[str]
 ) -> Iterator[tuple[str, Entry]]:
-    """Entries of ``eval --json`` (spec §8), one method after the other."""
+    """Entries of ``eval --json``, one method after the other."""
     settings, protocol = subject.settings, subject.settings.protocol
     states, teacher_n = _clean_rollouts(subject)
     limit_n = plant(settings.plant).force_limit_n

@@ -1,6 +1,6 @@
 """``hjepa scale``: how many control loops one radio cell supports, by method and SNR.
 
-Closed-loop tolerances (``eval``'s curves) → devices by the law ``duty`` or ``equal`` (spec §5) → a
+Closed-loop tolerances (``eval``'s curves) → devices by the law ``duty`` or ``equal`` → a
 table, ``devices.csv`` and the paper's Fig. 4.
 """
 
@@ -41,7 +41,7 @@ def run(
     remeasure: bool = False,
     verify: bool = False,
 ) -> dict[str, Any]:
-    """Count devices; returns the document of spec §8 ``scale``.
+    """Count devices; returns the document of ``--json``.
 
     Args:
         settings: the cell (``radio``), the methods and the protocol.

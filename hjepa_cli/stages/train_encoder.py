@@ -1,4 +1,4 @@
-"""``hjepa train-encoder``: learn Ψ and its companion P^H from rendered frames (spec §3).
+"""``hjepa train-encoder``: learn Ψ and its companion P^H from rendered frames.
 
 Dataset → encoder checkpoint. The story: render the trajectories once, train the JEPA on whole
 sub-sampled trajectories, look at the representation's health every epoch, and let the stage gates
@@ -45,7 +45,7 @@ PROBE_EPOCHS = 20  # of the quick probe actor that watches training
 def run(
     settings: Settings, screen: Screen, *, dataset: Path | None = None, out: Path | None = None
 ) -> dict[str, Any]:
-    """Train, gate and save an encoder; returns the document of spec §8 ``train-encoder``.
+    """Train, gate and save an encoder; returns the document of ``--json``.
 
     Raises:
         MissingInputError: no dataset.
@@ -184,7 +184,7 @@ def examine(
     every: int,
     epochs: int | None = PROBE_EPOCHS,
 ) -> dict[str, Any]:
-    """Health of frozen embeddings (spec §3), from every ``every``-th frame of both splits.
+    """Health of frozen embeddings, from every ``every``-th frame of both splits.
 
     ``every`` divides h, so that the embeddings a stride apart are among them.
     ``epochs`` limits the probe actor's fit; ``None`` fits it in full, on mirrored frames too when
@@ -218,7 +218,7 @@ def examine(
 
 
 def judge(report: dict[str, Any], options: EncoderSettings) -> dict[str, dict[str, Any]]:
-    """Compare the health report with the stage gates of spec §3."""
+    """Compare the health report with the stage gates."""
     lower_bounds = {
         f"probe_r2_{name}": getattr(options, f"gate_r2_{name}") for name in health.STATE_NAMES
     }

@@ -54,7 +54,7 @@ def run(
     encoder: str | None = None,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Train the hierarchy on a frozen encoder; returns the document of spec §8.
+    """Train the hierarchy on a frozen encoder; returns the document of ``--json``.
 
     Raises:
         UsageError: strides that do not nest.

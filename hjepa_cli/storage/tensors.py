@@ -64,7 +64,7 @@ def plain_array(array: np.ndarray, name: str) -> np.ndarray:
 
 
 def content_digest(metadata: Any, tensors: Mapping[str, np.ndarray]) -> str:
-    """Return the sha256 over the metadata, then each tensor's name, dtype, shape, bytes (spec §6).
+    """Return the sha256 over the metadata, then each tensor's name, dtype, shape, bytes.
 
     It covers the content, not the file: another writer of the same values has the same digest.
     """
