@@ -129,7 +129,7 @@ def film(
 
 
 def describe(data: Dataset, seconds: float, frames_per_s: float | None) -> dict[str, Any]:
-    """The document of ``--json``; ``training_uplink_bits`` is what sending its frames would take."""
+    """The document of ``--json``; ``training_uplink_bits``: what sending its frames would take."""
     count, steps = (data.splits["train"][key] for key in ("trajectories", "steps"))
     return {
         "dataset": str(data.path),
