@@ -12,7 +12,8 @@ ARGS ?=
 
 demo:
 	@scripts/venv plot
-	.venv/bin/hjepa scale --snr 10:30 --checkpoint desktop-h4m2l1 $(ARGS)
+	.venv/bin/hjepa scale --snr 10:30 --checkpoint desktop-h4m2l1 \
+	  --methods hjepa,ts-jepa-1,ts-jepa-4,hold,hold-true,oracle $(ARGS)
 
 test:
 	@scripts/venv test
