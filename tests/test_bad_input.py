@@ -306,7 +306,8 @@ def test_no_dataset_yet_names_the_command_that_makes_one(shell):
     refused(shell, 66, "train-encoder", says=["hjepa collect"])
 
 
-def test_no_encoder_yet_names_the_command_that_makes_one(shell, dataset):
+def test_no_encoder_yet_names_the_command_that_makes_one(shell, dataset, monkeypatch):
+    monkeypatch.setattr("hjepa_cli.storage.zoo.list_models", list)
     refused(shell, 66, "train-hierarchy", says=["hjepa train-encoder"])
 
 
