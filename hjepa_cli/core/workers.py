@@ -6,10 +6,12 @@ A control step is many small operations on few devices, which threads do not spe
 import multiprocessing
 import os
 import signal
+import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from types import TracebackType
@@ -56,7 +58,8 @@ class Workers:
         )
 
     def __call__(self, blocks: Sequence[Block], tick: Tick) -> list[Outcome]:
-        futures = [self._pool.submit(_simulate, block) for block in blocks]
+        with _anonymous_main():  # workers start with the first blocks
+            futures = [self._pool.submit(_simulate, block) for block in blocks]
         waiting, told = set(futures), self._done.value
         while waiting:
             waiting = wait(waiting, TICK_S).not_done
@@ -84,6 +87,22 @@ class Workers:
             for process in multiprocessing.active_children():
                 process.terminate()
         self._pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _anonymous_main() -> Iterator[None]:
+    """Keep spawned processes from running the user's script again.
+
+    They would import it, which needs a ``__main__`` guard there and fails for standard input.
+    """
+    main = sys.modules["__main__"].__dict__
+    hidden = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+    main.pop("__file__", None)
+    main["__spec__"] = None
+    try:
+        yield
+    finally:
+        main.update(hidden)
 
 
 # What a worker process keeps between blocks.
