@@ -8,7 +8,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import torch
 from hjepa_cli.core import workers as workers_module
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.loop import Outcome
 from hjepa_cli.core.methods import (
     TRUE_STATE,
     embedding_method,
@@ -30,7 +32,7 @@ from hjepa_cli.core.payload import quantise
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.policy import teacher
 from hjepa_cli.core.protocol import Point
-from hjepa_cli.core.simulator import Block, Simulator, run_points
+from hjepa_cli.core.simulator import BLOCK_DEVICES, Block, Simulator, Tick, run_points
 from hjepa_cli.core.workers import Workers
 from hjepa_cli.errors import DataError, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
@@ -266,7 +268,9 @@ def test_methods_without_a_model_are_skipped_with_the_command_that_trains_them(
     assert "autoencoder-2 skipped" in output.text
 
 
-def test_without_any_model_the_true_state_methods_remain(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_any_model_the_true_state_methods_remain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(zoo, "list_models", list)
     output = Output()
     result = evaluate.run(small(methods=("hjepa", "oracle")), output.screen)
@@ -406,24 +410,24 @@ def test_damaged_curves_are_refused_beside_a_model_and_passed_over_elsewhere(
 
 
 def test_blocks_cover_the_devices_and_do_not_depend_on_the_runner() -> None:
-    settings = small(bracket_devices=150, steps=2)
+    devices = 2 * BLOCK_DEVICES + 3
+    settings = small(bracket_devices=devices, steps=2)
     asked: list[Block] = []
 
-    def runner(blocks: Any, tick: Any) -> Any:
+    def runner(blocks: Sequence[Block], tick: Tick) -> list[Outcome]:
         asked.extend(blocks)
         return Simulator(settings, None)(blocks, tick)
 
     ticks: list[int] = []
     points = [Point("gap", 2.0), Point("delivery", 8.0)]
-    outcome = run_points(runner, "oracle", points, 150, ticks.append)
-    assert [(block.start, block.stop) for block in asked] == [(0, 64), (64, 128), (128, 150)]
-    assert outcome.score.shape == outcome.cost.shape == (2, 150)
-    assert sum(ticks) == 2 * 150 * 2  # points, devices, steps
-    few: list[Block] = []
-    run_points(
-        lambda blocks, tick: few.extend(blocks) or runner(blocks, tick), "oracle", points, 5, print
-    )
-    assert [(block.start, block.stop) for block in few] == [(0, 3), (3, 5)]
+    outcome = run_points(runner, "oracle", points, devices, ticks.append)
+    cuts = [0, BLOCK_DEVICES, 2 * BLOCK_DEVICES, devices]
+    assert [(block.start, block.stop) for block in asked] == list(pairwise(cuts))
+    assert outcome.score.shape == outcome.cost.shape == (2, devices)
+    assert sum(ticks) == 2 * devices * 2  # points, devices, steps
+    asked.clear()
+    run_points(runner, "oracle", points, 5, ticks.append)
+    assert [(block.start, block.stop) for block in asked] == [(0, 3), (3, 5)]  # two at least
 
 
 def test_a_block_of_some_devices_equals_those_among_all() -> None:
@@ -478,6 +482,15 @@ def test_an_interrupt_ends_the_workers_at_once() -> None:
         raise KeyboardInterrupt
     assert not multiprocessing.active_children()
     assert time.monotonic() - started < 30
+
+
+def test_workers_do_not_run_the_user_s_script_again() -> None:
+    """A script without a guard, or one from standard input, may call us too."""
+    before = dict(sys.modules["__main__"].__dict__)
+    with workers_module._anonymous_main():
+        sent = multiprocessing.spawn.get_preparation_data("worker")
+    assert not [key for key in sent if key.startswith("init_main")]
+    assert sys.modules["__main__"].__dict__ == before
 
 
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:

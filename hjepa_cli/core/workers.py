@@ -96,13 +96,14 @@ def _anonymous_main() -> Iterator[None]:
     They would import it, which needs a ``__main__`` guard there and fails for standard input.
     """
     main = sys.modules["__main__"].__dict__
-    hidden = {name: main[name] for name in ("__spec__", "__file__") if name in main}
-    main.pop("__file__", None)
+    spec, file = main["__spec__"], main.pop("__file__", None)
     main["__spec__"] = None
     try:
         yield
     finally:
-        main.update(hidden)
+        main["__spec__"] = spec
+        if file is not None:
+            main["__file__"] = file
 
 
 # What a worker process keeps between blocks.
