@@ -426,8 +426,9 @@ def test_blocks_cover_the_devices_and_do_not_depend_on_the_runner() -> None:
     assert outcome.score.shape == outcome.cost.shape == (2, devices)
     assert sum(ticks) == 2 * devices * 2  # points, devices, steps
     asked.clear()
+    run_points(runner, "oracle", points, 64, ticks.append)
     run_points(runner, "oracle", points, 5, ticks.append)
-    assert [(block.start, block.stop) for block in asked] == [(0, 3), (3, 5)]  # two at least
+    assert [(block.start, block.stop) for block in asked] == [(0, 32), (32, 64), (0, 5)]
 
 
 def test_a_block_of_some_devices_equals_those_among_all() -> None:
@@ -461,14 +462,14 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
 
 def test_a_dead_worker_is_reported_and_none_is_left_behind() -> None:
     points = [Point("gap", 3.0)]
-    with Workers(small(steps=8), None, 2) as workers:
-        run_points(workers, "oracle", points, 4, lambda steps: None)
+    with Workers(small(steps=8, bracket_devices=64), None, 2) as workers:
+        run_points(workers, "oracle", points, 64, lambda steps: None)
         processes = multiprocessing.active_children()
         assert len(processes) == 2
         for process in processes:
             process.kill()
         with pytest.raises(NumericalError, match="a worker process died"):
-            run_points(workers, "oracle", points, 4, lambda steps: None)
+            run_points(workers, "oracle", points, 64, lambda steps: None)
     assert not multiprocessing.active_children()
 
 

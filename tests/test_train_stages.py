@@ -57,6 +57,11 @@ def train(root: Path, out: str, **changes: object) -> Model:
     return Model.load(Path(result["checkpoint"]), "cpu")
 
 
+def networks(path: Path) -> torch.nn.ModuleDict:
+    """What a run trained."""
+    return load_modules(load_checkpoint(path / "model.safetensors"))
+
+
 def test_the_encoder_run_repeats_to_the_last_bit(workplace: Path) -> None:
     train_encoder.run(settings(), QUIET, dataset=workplace / "data", out=workplace / "again")
     first, again = (
@@ -105,8 +110,8 @@ def test_gates_pass_exactly_at_their_thresholds() -> None:
 
 def test_the_hierarchy_takes_the_encoder_as_it_is(workplace: Path) -> None:
     model = train(workplace, "hierarchy")
-    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"))
-    taken = model.modules["encoder"].state_dict()
+    source = networks(workplace / "encoder")
+    taken = networks(workplace / "hierarchy")["encoder"].state_dict()
     for name, tensor in source["encoder"].state_dict().items():
         assert torch.equal(taken[name], tensor), name
     assert model.methods == ("hjepa", "ts-jepa-4", "ts-jepa-1", "hold", "zero")
@@ -134,8 +139,9 @@ def test_other_strides_train_and_play(workplace: Path, h: int, m: int, l: int) -
 
 def test_the_companion_is_the_start_of_the_high_level_where_h_agrees(workplace: Path) -> None:
     frozen = {"hierarchy__coarse_learning_rate": 0.0}
-    source = load_modules(load_checkpoint(workplace / "encoder" / "model.safetensors"))
-    started = train(workplace, "from-companion", **frozen).modules["high"].state_dict()
+    source = networks(workplace / "encoder")
+    train(workplace, "from-companion", **frozen)
+    started = networks(workplace / "from-companion")["high"].state_dict()
     for name, tensor in source["high"].state_dict().items():
         assert torch.equal(started[name], tensor), name
 
@@ -154,17 +160,19 @@ def test_an_interrupted_run_starts_again_and_ends_the_same(workplace: Path) -> N
 
 
 def test_any_checkpoint_brings_its_encoder_but_only_a_hierarchy_drives(workplace: Path) -> None:
-    first = train(workplace, "first")
-    result = train_hierarchy.run(
+    train(workplace, "first")
+    train_hierarchy.run(
         settings(),
         QUIET,
         dataset=workplace / "data",
         encoder=str(workplace / "first"),
         out=workplace / "on-a-hierarchy",
     )
-    second = Model.load(Path(result["checkpoint"]), "cpu")
-    for name, tensor in first.modules["encoder"].state_dict().items():
-        assert torch.equal(second.modules["encoder"].state_dict()[name], tensor), name
+    first, second = (
+        networks(workplace / name)["encoder"].state_dict() for name in ("first", "on-a-hierarchy")
+    )
+    for name, tensor in first.items():
+        assert torch.equal(second[name], tensor), name
     with pytest.raises(DataError, match="of train-encoder, not of train-hierarchy"):
         Model.load(workplace / "encoder" / "model.safetensors")
 
@@ -200,12 +208,11 @@ def test_without_mirroring_nothing_is_mirrored(workplace: Path, monkeypatch) -> 
 
 
 def test_levels_do_not_disturb_each_other(workplace: Path) -> None:
-    short = train(workplace, "short", hierarchy__medium_steps=1)
-    long = train(workplace, "long", hierarchy__medium_steps=3)
+    train(workplace, "short", hierarchy__medium_steps=1)
+    train(workplace, "long", hierarchy__medium_steps=3)
+    short, long = (networks(workplace / name) for name in ("short", "long"))
     for name in ("high", "flat"):
-        for a, b in zip(
-            short.modules[name].parameters(), long.modules[name].parameters(), strict=True
-        ):
+        for a, b in zip(short[name].parameters(), long[name].parameters(), strict=True):
             assert torch.equal(a, b)
 
 

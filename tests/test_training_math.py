@@ -222,6 +222,28 @@ def test_centred_embeddings_are_offset_by_one_before_their_length_is_fixed() -> 
     assert encoder_module.CENTRE_OFFSET == 1.0
 
 
+@pytest.mark.parametrize("centre", [True, False])
+def test_a_folded_encoder_is_the_same_function(centre: bool) -> None:
+    """Batch norms with arbitrary statistics and affine parts, moved into the convolutions."""
+    torch.manual_seed(0)
+    encoder = Encoder(16, "difference", centre)
+    with torch.no_grad():
+        for layer in encoder.modules():
+            if isinstance(layer, torch.nn.BatchNorm2d | torch.nn.BatchNorm1d):
+                layer.running_mean.normal_()
+                layer.running_var.uniform_(0.5, 2.0)
+                if layer.affine:
+                    layer.weight.uniform_(0.5, 1.5)
+                    layer.bias.normal_()
+    frames = torch.randint(0, 256, (4, 2, 64, 128, 3), dtype=torch.uint8)
+    encoder.fit_standardisation(frames)
+    encoder.eval()
+    folded = encoder.folded()
+    assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    with torch.no_grad():
+        torch.testing.assert_close(folded(frames), encoder(frames), atol=1e-4, rtol=1e-4)
+
+
 def test_the_actor_drops_units_in_training_and_none_in_evaluation() -> None:
     torch.manual_seed(5)
     z = torch.randn(1, 8).expand(400, -1)

@@ -27,7 +27,7 @@ from hjepa_cli.settings import ProtocolSettings
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-LOOP_VERSION = 1  # raise it whenever a measured number changes: cached curves then expire
+LOOP_VERSION = 2  # raise it whenever a measured number changes: cached curves then expire
 STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
 _DRAWS_KEY = 0xD4A5
 

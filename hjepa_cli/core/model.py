@@ -1,5 +1,6 @@
 """A trained model: encoder, predictors and actor in one object, as a checkpoint holds them."""
 
+import copy
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -15,11 +16,11 @@ from hjepa_cli.core.controllers import Planner
 from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.hierarchy import Strides, build_predictors, hold, plan_stride
 from hjepa_cli.core.plant import plant
-from hjepa_cli.core.training import autocast, resolve_device
+from hjepa_cli.core.training import autocast, compute_dtype, resolve_device
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
 
-ENCODE_BATCH = 250
+ENCODE_BATCH = 64  # larger ones fall out of the caches
 
 
 def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
@@ -86,6 +87,17 @@ def encode_frames(
     return torch.cat(parts)
 
 
+def for_inference(modules: nn.ModuleDict, device: torch.device, precision: str) -> nn.ModuleDict:
+    """A copy that computes the same sooner: batch norms folded, weights cast once for all calls."""
+    networks = copy.deepcopy(modules).to(device).eval()
+    networks["encoder"] = networks["encoder"].folded()  # type: ignore[operator]
+    dtype = compute_dtype(device, precision)
+    for layer in networks.modules():
+        if isinstance(layer, nn.Conv2d | nn.Linear):
+            layer.to(dtype)
+    return networks
+
+
 class Model:
     """Everything inference needs, from one hierarchy checkpoint."""
 
@@ -99,7 +111,7 @@ class Model:
         self.force_limit_n = plant(self.plant_name).force_limit_n
         self.strides = Strides(*(self.architecture[name] for name in ("h", "m", "l")))
         self.device = resolve_device(device)
-        self.modules = modules.to(self.device).eval()
+        self.networks = for_inference(modules, self.device, self.precision)
         self._planners: dict[str, Planner] = {
             "hjepa": _Hierarchical(self),
             f"ts-jepa-{self.strides.h}": _Flat(self, "high", self.strides.h),
@@ -130,7 +142,7 @@ class Model:
     def encode(self, frames: NDArray[np.uint8]) -> Tensor:
         """Frames uint8 [N, 2, 64, 128, 3] (previous, current) → embeddings float32 [N, D]."""
         return encode_frames(
-            self.modules["encoder"],
+            self.networks["encoder"],
             torch.from_numpy(frames),
             device=self.device,
             precision=self.precision,
@@ -158,7 +170,7 @@ class Model:
         return autocast(self.device, self.precision)
 
     def _act(self, z: Tensor) -> Tensor:
-        return self.modules["actor"].act(z).float()  # type: ignore[no-any-return, operator]
+        return self.networks["actor"].act(z).float()  # type: ignore[no-any-return, operator]
 
 
 class _Hierarchical:
@@ -169,13 +181,13 @@ class _Hierarchical:
         self.stride = model.strides.h
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        modules = self._model.modules
+        networks = self._model.networks
         with self._model.autocast():
             actions, _, z_next = plan_stride(
                 self._model._act,
-                modules["high"],
-                modules["medium"],
-                modules["low"],
+                networks["high"],
+                networks["medium"],
+                networks["low"],
                 z,
                 self._model.strides,
                 recompute_anchor=self._model.architecture["stride_actions"] == "all",
@@ -187,7 +199,7 @@ class _Flat:
     """TS-JEPA: one predictor of a fixed depth, the action held in between."""
 
     def __init__(self, model: Model, name: str, stride: int) -> None:
-        self._model, self._predictor, self.stride = model, model.modules[name], stride
+        self._model, self._predictor, self.stride = model, model.networks[name], stride
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
         with self._model.autocast():

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 KINDS = ("gap", "delivery")
 STEP_OUT = 4  # brackets that a search goes outwards at a time, until the interval is inside
-MAX_GUESSES = 4  # points of a search placed by guessing, before it bisects
+MAX_GUESSES = 4  # rounds of a search that go by guessing, before it bisects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,6 +141,8 @@ class Search:
         self._measured: dict[float, tuple[Floats, Floats]] = {}
         self._reference = reference
         self._level, self._bracket = protocol.acceptable_score, protocol.bracket
+        self._step_out = 1 + STEP_OUT * protocol.bracket
+        self._rounds = 0
 
     @property
     def points(self) -> list[Point]:
@@ -157,10 +159,10 @@ class Search:
         """Take the outcome of a wanted point, [N] each."""
         self._measured[point.gap] = (score, cost)
 
-    def wanted(self) -> Point | None:
-        """The next point to measure with many devices; ``None`` when the search is over."""
-        gap = self._next()
-        return None if gap is None else Point(self.kind, gap)
+    def wanted(self) -> list[Point]:
+        """The next points to measure with many devices; none when the search is over."""
+        self._rounds += 1
+        return [Point(self.kind, gap) for gap in self._next() if gap not in self._measured]
 
     def result(self) -> Tolerance:
         """The crossing and its interval from the points with many devices."""
@@ -170,28 +172,25 @@ class Search:
             self._bounded(crossing), (self._bounded(low), self._bounded(high)), crossing == math.inf
         )
 
-    def _next(self) -> float | None:
+    def _next(self) -> Sequence[float]:
         scores = self._best_known()
         gaps = sorted(scores)
         left, right = _bracket(gaps, [scores[gap] for gap in gaps], self._level)
         if left is not None and right is not None and right / left - 1 > self._bracket:
             return self._between(left, right, scores)
-        for end in (left, right):
-            if end is not None and end not in self._measured:
-                return end
-        return self._next_for_interval()
+        ends = [end for end in (left, right) if end is not None and end not in self._measured]
+        return ends or self._next_for_interval()
 
-    def _next_for_interval(self) -> float | None:
+    def _next_for_interval(self) -> Sequence[float]:
         """Widen the measured range until the interval lies inside it."""
         first, last = min(self._measured), max(self._measured)
-        start, end = min(self._grid), max(self._grid)
         low, high = self._interval()
-        step = 1 + STEP_OUT * self._bracket
-        if low == -math.inf and first > start:
-            return max(first / step, start)
-        if high == math.inf and last < end:
-            return min(last * step, end)
-        return None
+        wider = []
+        if low == -math.inf:
+            wider.append(max(first / self._step_out, min(self._grid)))
+        if high == math.inf:
+            wider.append(min(last * self._step_out, max(self._grid)))
+        return wider
 
     def _best_known(self) -> dict[float, float]:
         """Scores by gap: with many devices where measured, else the grid's."""
@@ -209,18 +208,24 @@ class Search:
         gaps = np.array(sorted(self._measured))
         return metrics.first_crossing(gaps, scores, self._level, log=self._log)
 
-    def _between(self, left: float, right: float, scores: Mapping[float, float]) -> float:
+    def _between(self, left: float, right: float, scores: Mapping[float, float]) -> Sequence[float]:
         """Where to cut a bracket that is too wide.
 
-        At the guessed crossing, but a bracket's width away from either end: near an end that
-        closes the bracket at once. In the middle where the bracket is short, and when guessing
-        has not helped.
+        First at the guessed crossing and as far to both sides as intervals usually reach; then
+        with two cuts, a bracket's width apart, around a better guess. In the middle where the
+        bracket is short, and when guessing has not helped.
         """
         width = 1 + self._bracket
-        if len(self._measured) >= MAX_GUESSES or right / left <= width**2:
-            return self._middle(left, right)
+        if self._rounds > MAX_GUESSES or right / left <= width**2:
+            return [self._middle(left, right)]
         guess = self._guess(left, right, scores)
-        return min(max(guess, left * width), right / width)
+        if not self._measured:
+            ends = min(self._grid), max(self._grid)
+            fan = (guess / self._step_out, guess, guess * self._step_out)
+            return sorted({min(max(gap, ends[0]), ends[1]) for gap in fan})
+        guess = min(max(guess, left * width), right / width)
+        half = math.sqrt(width) * (1 - 1e-9)
+        return [gap for gap in (guess / half, guess * half) if left < gap < right]
 
     def _guess(self, left: float, right: float, scores: Mapping[float, float]) -> float:
         """The crossing on a line: between the ends, unless just one of them is measured.
@@ -304,7 +309,7 @@ def measure_curves(
         grid[kind] = ([Point(kind, gap) for gap in gaps], joined)
         scores = reference.relative_score(joined)
         searches[kind] = Search(kind, gaps, scores, reference, protocol)
-    while wanted := [point for search in searches.values() if (point := search.wanted())]:
+    while wanted := [point for search in searches.values() for point in search.wanted()]:
         outcome = measure(wanted, protocol.bracket_devices)
         for row, point in enumerate(wanted):
             searches[point.kind].add(point, outcome.score[row], outcome.cost[row])

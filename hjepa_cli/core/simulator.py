@@ -16,6 +16,7 @@ from hjepa_cli.core.protocol import Point
 from hjepa_cli.settings import Settings
 
 BLOCK_DEVICES = 128
+SMALL_DEVICES = 32  # not worth a second process
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +95,10 @@ def run_points(
 ) -> Outcome:
     """Simulate the first ``devices`` devices at some points: outcome arrays [P, devices].
 
-    The devices are cut into blocks, at least two and always the same ones, so that results do not
-    depend on how many processes there are.
+    The devices are cut into blocks, two at least unless they are few, and always the same ones, so
+    that results do not depend on how many processes there are.
     """
-    size = min(BLOCK_DEVICES, -(-devices // 2))
+    size = min(BLOCK_DEVICES, max(-(-devices // 2), SMALL_DEVICES))
     blocks = [
         Block(method, tuple(points), start, min(start + size, devices), reactive)
         for start in range(0, devices, size)

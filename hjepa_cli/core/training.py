@@ -27,10 +27,16 @@ def resolve_device(name: str) -> torch.device:
 
 
 def autocast(device: torch.device, precision: str) -> AbstractContextManager[object]:
-    """bf16 autocast where the hardware multiplies bf16; ``precision`` auto | bf16 | fp32."""
+    """Compute in :func:`compute_dtype`, through torch's autocast."""
+    enabled = compute_dtype(device, precision) == torch.bfloat16
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
+
+
+def compute_dtype(device: torch.device, precision: str) -> torch.dtype:
+    """What layers compute in; ``precision`` auto | bf16 | fp32, auto as the hardware has it."""
     if precision == "auto":
         precision = "bf16" if _multiplies_bf16(device) else "fp32"
-    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
+    return torch.bfloat16 if precision == "bf16" else torch.float32
 
 
 def _multiplies_bf16(device: torch.device) -> bool:
