@@ -20,6 +20,7 @@ from typing import Self
 import torch
 
 from hjepa_cli.core.loop import Outcome
+from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import Model
 from hjepa_cli.core.simulator import Block, Simulator, Tick
 from hjepa_cli.errors import NumericalError
@@ -119,6 +120,7 @@ def _start(settings: Settings, model_path: Path | None, done: "Synchronized[int]
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
+    keep_freed_memory()
     _settings, _model_path, _done = settings, model_path, done
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from hjepa_cli import __version__
 from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import encode_frames
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.training import resolve_device
@@ -148,6 +149,7 @@ def training_run(stage: str, out: Path | None, settings: Settings, screen: Scree
 
     An interrupted run starts again: the seed decides everything, so it ends as it would have.
     """
+    keep_freed_memory()
     with Run.create(stage, out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")

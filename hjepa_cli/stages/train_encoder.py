@@ -100,7 +100,7 @@ def run(
 
 def describe_architecture(settings: Settings) -> dict[str, Any]:
     """What :func:`build_modules` needs, as it goes into the checkpoint."""
-    encoder, hierarchy = settings.encoder, settings.hierarchy
+    encoder = settings.encoder
     return {
         "kind": "encoder",
         "embedding": encoder.embedding,
@@ -110,8 +110,8 @@ def describe_architecture(settings: Settings) -> dict[str, Any]:
         "stride_actions": encoder.stride_actions,
         "residual": encoder.residual,
         "h": encoder.h,
-        "m": hierarchy.m if encoder.h % hierarchy.m == 0 else 1,
-        "l": 1,
+        "m": encoder.h,  # one level: the companion
+        "l": encoder.h,
     }
 
 
