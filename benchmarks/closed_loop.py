@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core.camera import Camera
-from hjepa_cli.core.methods import TRUE_STATE
 from hjepa_cli.core.model import Model, build_modules
 from hjepa_cli.core.plant import CartPoles, plant
 from hjepa_cli.core.protocol import Point

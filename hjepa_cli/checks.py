@@ -33,6 +33,9 @@ METHODS = (
     "local",
 )
 
+# Those that send the true state: they render and encode nothing.
+TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
+
 LARGEST_SEED = 2**63 - 1
 LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
 LARGEST_STRIDE = 10_000

@@ -7,23 +7,29 @@ within a factor of a few. Nothing is written here.
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.errors import HjepaError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
+
+if TYPE_CHECKING:
+    from hjepa_cli.stages.evaluate import Subject
 
 FRAME_BYTES = 64 * 128 * 3
 ENCODER_PARAMETERS = 1_500_000
 RATES_PER_S = {  # two cores of a server CPU
     "simulated steps": 400_000.0,
     "rendered frames": 6_000.0,
-    "encoder training frames": 450.0,
+    "encoder training frames": 400.0,
     "encoded frames": 3_000.0,
     "level training steps": 8.0,
-    "closed-loop frames": 2_000.0,
+    "closed-loop frames": 3_500.0,
+    "device-steps on embeddings": 50_000.0,
+    "device-steps on states": 300_000.0,
 }
-STATE_METHODS = ("hold-true", "zero-true", "optimal", "oracle")  # these render and encode nothing
+SEARCH_POINTS = 6  # of a tolerance, as a rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,13 +155,15 @@ def plan_eval(
     remeasure: bool,
 ) -> Plan:
     """Plan of ``hjepa eval``."""
+    subject = _subject(settings, checkpoint, dataset)
+    missing = _uncached(subject, remeasure=remeasure)
     return Plan(
         command="eval",
-        reads=[_model(checkpoint, settings), _clean(dataset, settings)],
-        work=[_loop_line(settings) + ("" if remeasure else ", unless its curves are cached")],
+        reads=[f"model {subject.name}", _clean(dataset, settings)],
+        work=_loop_lines(subject, missing),
         writes=[f"run {_run('eval', out)}"],
         writes_bytes=200_000,
-        seconds=10 + _loop_seconds(settings),
+        seconds=5 + _loop_seconds(settings, missing),
     )
 
 
@@ -171,22 +179,25 @@ def plan_scale(
 ) -> Plan:
     """Plan of ``hjepa scale``."""
     radio = settings.radio
+    subject = _subject(settings, checkpoint, dataset)
+    missing = _uncached(subject, remeasure=remeasure)
+    methods = subject.measurable(settings.methods)
     work = [
-        "measure the closed-loop curves again" if remeasure else "use cached curves where they fit",
+        *_loop_lines(subject, missing),
         f"count devices by law '{radio.law}' at {', '.join(f'{value:g}' for value in snr_db)} dB "
-        f"in {radio.bandwidth_hz / 1e6:g} MHz for {len(settings.methods)} methods",
+        f"in {radio.bandwidth_hz / 1e6:g} MHz for {len(methods)} methods",
     ]
-    if remeasure:
-        work.insert(1, _loop_line(settings))
+    seconds = 5 + _loop_seconds(settings, missing)
     if verify:
         work.append("simulate one block at 0.9 and 1.1 of each tolerance")
+        seconds += _drive_seconds(settings, methods, 2 * settings.protocol.bracket_devices)
     return Plan(
         command="scale",
-        reads=[_model(checkpoint, settings), _clean(dataset, settings)],
+        reads=[f"model {subject.name}", _clean(dataset, settings)],
         work=work,
         writes=[f"run {_run('scale', out)} with the table (CSV) and the figure (PNG, SVG)"],
         writes_bytes=300_000,
-        seconds=10 + (_loop_seconds(settings) if remeasure else 0.0),
+        seconds=seconds,
     )
 
 
@@ -224,22 +235,55 @@ def _predictor(settings: Settings, actions: int) -> int:
     return (inputs + 1 + settings.encoder.embedding) * settings.encoder.hidden
 
 
-def _loop_line(settings: Settings) -> str:
+def _subject(settings: Settings, checkpoint: str | None, dataset: Path | None) -> "Subject":
+    """What the stage would open, without a word."""
+    from hjepa_cli.stages.evaluate import open_subject
+
+    return open_subject(settings, Screen(quiet=True), checkpoint, dataset)
+
+
+def _uncached(subject: "Subject", *, remeasure: bool) -> list[str]:
+    """The methods whose curves the stage would measure."""
+    from hjepa_cli.stages.evaluate import cached
+
+    found = {} if remeasure else cached(subject)
+    return [name for name in subject.measurable(subject.settings.methods) if name not in found]
+
+
+def _loop_lines(subject: "Subject", missing: list[str]) -> list[str]:
+    options = subject.settings.protocol
+    known = [name for name in subject.measurable(subject.settings.methods) if name not in missing]
+    lines = [f"take the cached curves of {', '.join(known)}"] if known else []
+    if missing:
+        lines.append(
+            f"drive {options.curve_devices} devices for {options.steps} steps at each of "
+            f"{len(options.gaps)} gaps and as many delivery probabilities, "
+            f"{options.bracket_devices} near the limit, with {', '.join(missing)}"
+        )
+    return lines
+
+
+def _loop_seconds(settings: Settings, methods: list[str]) -> float:
+    """Both grids with few devices, then the searches with many."""
     options = settings.protocol
-    return (
-        f"drive {options.curve_devices} devices for {options.steps} steps at each of "
-        f"{len(options.gaps)} gaps and as many delivery probabilities, "
-        f"{options.bracket_devices} near the limit, for {len(settings.methods)} methods"
+    grids = 2 * len(options.gaps) * options.curve_devices
+    searches = 2 * SEARCH_POINTS * options.bracket_devices
+    frames = 2 * options.curve_devices * options.steps * sum(1.0 / gap for gap in options.gaps)
+    pixels = sum(name not in TRUE_STATE for name in methods)
+    driving = _drive_seconds(settings, methods, grids + searches)
+    return driving + _seconds({"closed-loop frames": pixels * frames})
+
+
+def _drive_seconds(settings: Settings, methods: list[str], devices: int) -> float:
+    """So many devices for all steps, under each of the methods."""
+    device_steps = settings.protocol.steps * devices
+    states = sum(name in TRUE_STATE for name in methods)
+    return _seconds(
+        {
+            "device-steps on embeddings": (len(methods) - states) * device_steps,
+            "device-steps on states": states * device_steps,
+        }
     )
-
-
-def _loop_seconds(settings: Settings) -> float:
-    """Methods that see frames encode one per update; the others are nearly free."""
-    options = settings.protocol
-    updates = sum(1.0 / gap for gap in options.gaps)
-    pixels = sum(method not in STATE_METHODS for method in settings.methods)
-    frames = 2 * pixels * options.curve_devices * options.steps * updates
-    return _seconds({"closed-loop frames": frames})
 
 
 def _dataset(path: Path | None, settings: Settings) -> str:
@@ -256,27 +300,12 @@ def _clean(path: Path | None, settings: Settings) -> str:
 
 
 def _encoder(name: str | None, settings: Settings) -> str:
-    found = _named(name) or _newest_run("train-encoder", settings)
+    from hjepa_cli.stages.train_hierarchy import open_encoder
+
+    if name is not None:
+        return f"encoder {open_encoder(name, settings, Screen(quiet=True)).path}"
+    found = _look(lambda: open_encoder(None, settings, Screen(quiet=True)).path)
     return f"encoder {found}" if found else "encoder: none yet (hjepa train-encoder)"
-
-
-def _model(name: str | None, settings: Settings) -> str:
-    found = _named(name) or _newest_run("train-hierarchy", settings)
-    return f"model {found}" if found else "model of the zoo, if it has one"
-
-
-def _named(name: str | None) -> Path | None:
-    from hjepa_cli.storage.zoo import resolve_model
-
-    return None if name is None else resolve_model(name)
-
-
-def _newest_run(stage: str, settings: Settings) -> Path | None:
-    from hjepa_cli.storage.runs import newest_run, read_config
-
-    return _look(
-        lambda: newest_run(stage, lambda run: read_config(run).get("plant") == settings.plant)
-    )
 
 
 def _look(find: Callable[[], Path | None]) -> Path | None:

@@ -226,6 +226,20 @@ def one_line(text: str) -> str:
     )
 
 
+def span(
+    value: float | None, interval: Sequence[float] | None, decimals: int, bound: str = ""
+) -> str | None:
+    """Set a number with its interval: ``112.5 (104.1 – 118.0)``.
+
+    ``bound`` stands before a number that is only known to lie on one side: ``≥ 320.0 (…)``.
+    """
+    if value is None:
+        return None
+    low, high = interval or (value, value)
+    text = f"{bound} {value:.{decimals}f}" if bound else f"{value:.{decimals}f}"
+    return f"{text} ({low:.{decimals}f} – {high:.{decimals}f})"
+
+
 def plain(value: Any) -> Any:
     """Turn a result into JSON values: arrays to lists, paths to strings, NaN and ±inf to None.
 

@@ -313,11 +313,11 @@ def test_quiet_prints_only_where_the_result_is(shell, stage):
 
 @pytest.mark.parametrize("command", MODULES)
 @pytest.mark.parametrize("preset", ["default", "paper", "gym", "smoke"])
-def test_dry_run_shows_a_plan_and_writes_nothing(shell, stage, command, preset):
+def test_dry_run_shows_a_plan_and_writes_nothing(shell, command, preset):
     with shell.untouched():
         outcome = shell(command, "--dry-run", "--preset", preset)
         document = shell(command, "--dry-run", "--preset", preset, "--json").document
-    assert outcome.code == 0 and outcome.err == "" and stage.name is None
+    assert outcome.code == 0 and outcome.err == ""
     lines = outcome.out.splitlines()
     assert lines[0] == f"hjepa {command} would"
     verbs = {line.split()[0] for line in lines[1:-1]}
@@ -328,6 +328,19 @@ def test_dry_run_shows_a_plan_and_writes_nothing(shell, stage, command, preset):
     assert [f"  do    {line}" for line in plan["work"]] == [
         line for line in lines if line.startswith("  do ")
     ]
+
+
+def test_dry_run_tells_cached_curves_from_those_to_measure(shell):
+    def planned(*flags):
+        return shell("eval", "--dry-run", "--json", "--methods", "oracle", *flags).document["plan"]
+
+    before = planned("--preset", "smoke")
+    assert before["work"][0].startswith("drive ") and before["work"][0].endswith("oracle")
+    assert shell("eval", "--preset", "smoke", "--methods", "oracle", "--quiet").code == 0
+    after, again = planned("--preset", "smoke"), planned("--preset", "smoke", "--remeasure")
+    assert after["work"] == ["take the cached curves of oracle"]
+    assert again["work"] == before["work"]
+    assert after["minutes"] < again["minutes"]
 
 
 def test_dry_run_follows_the_flags(shell, stage):
@@ -343,7 +356,8 @@ def test_dry_run_follows_the_flags(shell, stage):
     assert "here" in named
 
 
-def test_dry_run_still_refuses_what_the_command_would(shell, stage):
+def test_dry_run_still_refuses_what_the_command_would(shell):
+    assert_one_line_error(shell("eval", "--dry-run", "--checkpoint", "nowhere"), 66)
     assert_one_line_error(shell("train-encoder", "--dry-run", "--dataset", "nowhere"), 66)
     assert_one_line_error(shell("scale", "--dry-run", "--snr", "30:10"), 2)
 

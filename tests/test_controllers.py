@@ -13,10 +13,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
 from hjepa_cli.core.dynamics import rk4_step
 from hjepa_cli.core.loop import Controller, Draws, every_step, gap_schedule, simulate
-from hjepa_cli.core.methods import TRUE_STATE, embedding_method, true_state_method
+from hjepa_cli.core.methods import embedding_method, true_state_method
 from hjepa_cli.core.model import Model, build_modules
 from hjepa_cli.core.plant import CartPole, CartPoles, plant
 from hjepa_cli.core.policy import teacher

@@ -17,16 +17,12 @@ import numpy as np
 import pytest
 import torch
 
+from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core import workers as workers_module
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.loop import Outcome
-from hjepa_cli.core.methods import (
-    TRUE_STATE,
-    embedding_method,
-    embedding_sensor,
-    true_state_method,
-)
+from hjepa_cli.core.methods import embedding_method, embedding_sensor, true_state_method
 from hjepa_cli.core.model import Model, build_modules, tensors_of
 from hjepa_cli.core.payload import quantise
 from hjepa_cli.core.plant import plant
@@ -210,6 +206,19 @@ def test_an_interrupted_run_continues_after_the_last_method(
     assert result["methods"] == whole["methods"]
 
 
+def subject_of(settings: Settings, checkpoint: Path | str | None = None) -> evaluate.Subject:
+    name = None if checkpoint is None else str(checkpoint)
+    return evaluate.open_subject(settings, Output().screen, name, None)
+
+
+def curves_in_a_run(settings: Settings, checkpoint: Path | str, **options: Any) -> dict[str, Any]:
+    """As ``scale`` takes its curves."""
+    output, subject = Output(), subject_of(settings, checkpoint)
+    with Run.create("scale", None, settings.as_dict()) as record:
+        result = evaluate.curves_for(subject, output.screen, record, **options)
+    return result | {"text": output.text}
+
+
 def test_curves_lie_beside_the_model_of_a_run_but_never_in_the_zoo(tmp_path: Path) -> None:
     settings = small(methods=("hold-true",))
     with Run.create("train-hierarchy", None, settings.as_dict()) as record:
@@ -232,27 +241,33 @@ def test_without_runs_the_zoo_serves_and_its_curves_are_used(tmp_path: Path) -> 
     measured = evaluate.run(settings, Output().screen)
     assert measured["checkpoint"] == str(shipped)
     (shipped.parent / "curves.json").write_text(Path(measured["curves"]).read_text())
-    output = Output()
-    name, entries, source = evaluate.curves_for(settings, output.screen, methods=settings.methods)
-    assert name == str(shipped)
-    assert entries == measured["methods"]
-    assert "zoo/tiny/curves.json" in source
-    assert len(list(Path("runs/eval").iterdir())) == 1  # nothing was measured again
+    assert evaluate.cached(subject_of(settings)).keys() == {"hold-true", "oracle"}
+    again = evaluate.run(settings, Output().screen)
+    assert again["methods"] == measured["methods"]
+    assert "zoo/tiny/curves.json" in again["source"]  # nothing was measured again
 
 
-def test_curves_for_measures_what_is_missing_and_keeps_it(checkpoint: Path) -> None:
-    settings = small(methods=("hold-true",))
-    options = {"methods": ("oracle", "supervised-2"), "checkpoint": str(checkpoint)}
-    output = Output()
-    _, first, source = evaluate.curves_for(settings, output.screen, **options)
-    assert list(first) == ["oracle"]
-    assert "supervised-2 skipped" in output.text
-    assert "runs/eval/0001/curves.json" in source
-    _, second, _ = evaluate.curves_for(settings, Output().screen, **options)
-    assert second == first
-    assert len(list(Path("runs/eval").iterdir())) == 1
-    evaluate.curves_for(settings, Output().screen, **options, remeasure=True)
-    assert len(list(Path("runs/eval").iterdir())) == 2
+def test_curves_for_measures_what_is_missing_and_keeps_it(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = small(methods=("oracle", "supervised-2"))
+    measured: list[str] = []
+    entry = Bench.entry
+
+    def spy(bench: Bench, method: Any) -> dict[str, Any]:
+        measured.append(method.name)
+        return entry(bench, method)
+
+    monkeypatch.setattr(Bench, "entry", spy)
+    first = curves_in_a_run(settings, checkpoint)
+    assert list(first["methods"]) == measured == ["oracle"]
+    assert "supervised-2 skipped" in first["text"]
+    assert "runs/scale/0001/curves.json" in first["source"]
+    second = curves_in_a_run(settings, checkpoint)
+    assert second["methods"] == first["methods"]
+    assert measured == ["oracle"]
+    curves_in_a_run(settings, checkpoint, remeasure=True)
+    assert measured == ["oracle", "oracle"]
 
 
 def test_methods_without_a_model_are_skipped_with_the_command_that_trains_them(
@@ -307,20 +322,14 @@ def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:
     entry = result["methods"]["zero-true"]
     gaps = [point["d"] for point in entry["gap_bracket"]]
     probabilities = [point["p"] for point in entry["delivery_bracket"]]
+    subject = subject_of(settings, checkpoint)
     measured = evaluate.measure_points(
-        settings,
-        Output().screen,
-        method="zero-true",
-        gaps=gaps,
-        probabilities=probabilities,
-        checkpoint=str(checkpoint),
+        subject, Output().screen, method="zero-true", gaps=gaps, probabilities=probabilities
     )
     assert len(measured) == len(gaps) + len(probabilities) > 2
     assert measured == entry["gap_bracket"] + entry["delivery_bracket"]
     with pytest.raises(UsageError, match="no model for method 'ts-jepa-5'"):
-        evaluate.measure_points(
-            settings, Output().screen, method="ts-jepa-5", gaps=[1], checkpoint=str(checkpoint)
-        )
+        evaluate.measure_points(subject, Output().screen, method="ts-jepa-5", gaps=[1])
 
 
 # --- The cache ----------------------------------------------------------------------------------
@@ -344,13 +353,15 @@ def test_curves_of_another_digest_are_not_there(tmp_path: Path) -> None:
         curves.Digest.of("another", settings),
         curves.Digest.of("model", small(seed=1)),
         curves.Digest.of("model", small(steps=25)),
-        curves.Digest.of("model", settings, dataset="its digest"),
+        curves.Digest.of("model", settings, dataset=small(seed=1).as_dict()),
         dataclasses.replace(digest, loop_version=digest.loop_version + 1),
     ):
         assert other != digest
         assert curves.read(path, other) == {}
     # What a user asks to see does not change what was measured.
     assert curves.Digest.of("model", small(methods=("zero",))) == digest
+    # A dataset collected as these settings say holds the rollouts that they would make.
+    assert curves.Digest.of("model", settings, dataset=settings.as_dict()) == digest
 
 
 def test_writing_keeps_the_same_digest_and_replaces_others(tmp_path: Path) -> None:
@@ -550,9 +561,8 @@ def test_eval_uses_workers_where_they_are_worth_it(
     ):
         monkeypatch.setattr(evaluate, "cores", lambda available=available: available)
         monkeypatch.setattr(evaluate, "WORTH_WORKERS", worth)
-        evaluate.measure_points(
-            small(), Output().screen, method="oracle", gaps=[3], checkpoint=str(checkpoint)
-        )
+        subject = subject_of(small(), checkpoint)
+        evaluate.measure_points(subject, Output().screen, method="oracle", gaps=[3])
         assert asked == expected
         asked.clear()
 

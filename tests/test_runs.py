@@ -45,7 +45,7 @@ def test_new_runs_count_on() -> None:
     for number in (1, 2):
         with Run.create("eval", None, SETTINGS) as run:
             assert run.directory == Path("runs/eval") / f"{number:04d}"
-            assert run.result is None and not run.resumed and run.differences == []
+            assert run.result is None and not run.resumed
     with Run.create("scale", None, SETTINGS) as run:
         assert run.directory == Path("runs/scale/0001")
 
@@ -122,10 +122,10 @@ def test_a_finished_run_is_repeated_not_redone() -> None:
         run.finish({"score": 0.5})
     before = {path: path.read_bytes() for path in Path("out").iterdir()}
     with Run.create("eval", Path("out"), SETTINGS) as run:
-        assert run.result == {"score": 0.5} and run.differences == []
-    with Run.create("eval", Path("out"), changed("protocol.steps", 999)) as run:
         assert run.result == {"score": 0.5}
-        assert run.differences == ["protocol.steps = 1000, not 999"]
+    other = r"a finished run with other settings: protocol\.steps = 1000, not 999"
+    with pytest.raises(UsageError, match=other):
+        Run.create("eval", Path("out"), changed("protocol.steps", 999))
     assert {path: path.read_bytes() for path in Path("out").iterdir()} == before
 
 

@@ -36,12 +36,15 @@ def stage(tmp_path, monkeypatch):
         if checkpoint == "missing":
             raise MissingInputError("no model 'missing'")
         skipped = {name: "train it" for name in settings.methods if name not in ENTRIES}
-        return SimpleNamespace(path=tmp_path / "model", skipped=lambda methods: skipped)
+        return SimpleNamespace(
+            settings=settings, asked=(checkpoint, dataset), skipped=lambda methods: skipped
+        )
 
-    def curves_for(settings, screen, **arguments):
-        calls.append(arguments)
-        found = {name: ENTRIES[name] for name in arguments["methods"] if name in ENTRIES}
-        return "model", found, "curves of the test"
+    def curves_for(subject, screen, record, **arguments):
+        calls.append((*subject.asked, arguments))
+        methods = subject.settings.methods
+        found = {name: ENTRIES[name] for name in methods if name in ENTRIES}
+        return {"checkpoint": "model", "methods": found, "source": "curves of the test"}
 
     monkeypatch.setattr(scale, "open_subject", open_subject)
     monkeypatch.setattr(scale, "curves_for", curves_for)
@@ -115,9 +118,9 @@ def test_tables_show_every_method_and_snr_in_80_columns(stage):
     stage()
     assert "112.0 (100.8 – 123.2)" in stage.out.getvalue()
     assert "7225 (6503 – 7948)" in stage.out.getvalue()
-    assert "320.0 (at least)" in stage.out.getvalue()
+    assert "≥ 320.0 (288.0 – 352.0)" in stage.out.getvalue()
     stage(law="equal")
-    assert "0.0100 (at most)" in stage.out.getvalue()
+    assert "≤ 0.0100 (0.0090 – 0.0110)" in stage.out.getvalue()
 
 
 def test_csv_is_the_table_in_long_format(stage):
@@ -158,12 +161,13 @@ def test_a_finished_run_is_shown_again_without_measuring(stage, tmp_path):
     assert stage(out=tmp_path / "here", remeasure=True) == first
     assert len(stage.curves) == calls
     assert stage.out.getvalue() == printed
+    with pytest.raises(UsageError, match=r"a finished run with other settings: radio\.snr_db = "):
+        stage(out=tmp_path / "here", snr="10:20")
 
 
 def test_flags_reach_the_curves(stage, tmp_path):
     stage(remeasure=True, dataset=tmp_path / "data", checkpoint="zoo-name")
-    (arguments,) = stage.curves
-    assert arguments["remeasure"] is True and arguments["dataset"] == tmp_path / "data"
+    assert stage.curves == [("zoo-name", tmp_path / "data", {"remeasure": True})]
 
 
 def test_without_matplotlib_the_table_stays_and_the_pip_line_is_named(stage, monkeypatch):
@@ -201,7 +205,7 @@ def blocks(stage, monkeypatch):
     """Replace the closed loop: a score that falls by 0.3 per tolerance, ±0.02."""
     asked = []
 
-    def measure_points(settings, screen, *, method, gaps=(), probabilities=(), checkpoint):
+    def measure_points(subject, screen, *, method, gaps=(), probabilities=()):
         asked.append((method, [*gaps], [*probabilities]))
         measured = []
         for key, kind, values in (("d", "gap_steps", gaps), ("p", "p", probabilities)):
@@ -241,7 +245,10 @@ def test_verify_fails_where_the_loops_disagree(stage, blocks, tmp_path):
     with pytest.raises(NumericalError, match=r"not verified: hjepa at 0\.9 x its tolerance"):
         stage(verify=True, methods=("hjepa",), out=tmp_path / "here")
     assert "NOT VERIFIED" in stage.out.getvalue()
-    assert not (tmp_path / "here" / "result.json").exists()
+    # What was counted is kept, and the verdict stays.
+    assert (tmp_path / "here" / "result.json").exists()
+    with pytest.raises(NumericalError, match="not verified"):
+        stage(verify=True, methods=("hjepa",), out=tmp_path / "here")
 
 
 def test_verify_fails_where_the_interval_decides_nothing(stage, blocks):
@@ -274,8 +281,9 @@ def test_real_curves_of_the_true_state_methods(tmp_path, monkeypatch):
         scale.run(settings, Screen(stdout=io.StringIO(), stderr=io.StringIO())) for _ in range(2)
     )
     assert again["rows"] == first["rows"]
-    assert len(list(tmp_path.glob("runs/eval/*"))) == 1
-    (curves,) = tmp_path.glob("runs/eval/*/curves.json")
+    assert not list(tmp_path.glob("runs/eval/*"))  # one command, one run directory
+    curves = tmp_path / "runs/scale/0001/curves.json"
+    assert str(curves.relative_to(tmp_path)) in again["source"]
     measured = json.loads(curves.read_text())["methods"]["hold-true"]
     tolerance = measured["tolerance_gap_steps"]
     assert 1 < tolerance <= 80

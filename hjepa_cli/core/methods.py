@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
 from hjepa_cli.core.dynamics import rk4_step
@@ -27,7 +28,6 @@ from hjepa_cli.settings import Settings
 if TYPE_CHECKING:
     from hjepa_cli.core.model import Model
 
-TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
 SENSOR_BATCH = 256  # frame pairs rendered and encoded at a time: 12 MiB
 
 
@@ -70,7 +70,7 @@ def build_method(name: str, settings: Settings, model: "Model | None") -> Method
 
 
 def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Method:
-    """One of :data:`TRUE_STATE`.
+    """One of :data:`~hjepa_cli.checks.TRUE_STATE`.
 
     Args:
         name: the method.

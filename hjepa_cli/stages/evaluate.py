@@ -1,7 +1,7 @@
 """``hjepa eval``: prediction error, control score and tolerated losses of each method.
 
 A trained model (a run's or the zoo's) → closed-loop curves of every method, kept under a digest of
-all they depend on, and a table. ``scale`` takes the same curves through :func:`curves_for`.
+all they depend on, and tables. ``scale`` takes the same curves through :func:`curves_for`.
 """
 
 import dataclasses
@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import check_methods
+from hjepa_cli.checks import TRUE_STATE, check_methods
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.loop import Floats
-from hjepa_cli.core.methods import TRUE_STATE, build_method
+from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import WINDOWS
 from hjepa_cli.core.model import Model
 from hjepa_cli.core.plant import plant
@@ -23,7 +23,7 @@ from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.core.workers import MAX_WORKERS, Workers, cores
 from hjepa_cli.errors import DataError, UsageError
-from hjepa_cli.screen import Screen
+from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage import curves, runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE
@@ -73,7 +73,7 @@ class Subject:
         return Digest.of(
             self.model.digest if self.model else None,
             self.settings,
-            self.dataset.digest if self.dataset else None,
+            self.dataset.settings if self.dataset else None,
         )
 
     @property
@@ -121,7 +121,7 @@ def run(
     with Run.create("eval", out, settings.as_dict()) as record:
         result = record.result
         if result is None:
-            result = record.finish(_evaluate(subject, screen, record, settings.methods, remeasure))
+            result = record.finish(curves_for(subject, screen, record, remeasure=remeasure))
         else:
             screen.say(f"{record.directory} is finished; this is its result")
         show(result, screen)
@@ -129,43 +129,58 @@ def run(
 
 
 def curves_for(
-    settings: Settings,
-    screen: Screen,
-    *,
-    methods: Sequence[str],
-    checkpoint: str | None = None,
-    dataset: Path | None = None,
-    remeasure: bool = False,
-) -> tuple[str, dict[str, Entry], str]:
-    """Curves for ``scale``: cached where they fit, else measured and kept in a new eval run.
+    subject: Subject, screen: Screen, record: Run, *, remeasure: bool = False
+) -> dict[str, Any]:
+    """Take the curves of the settings' methods that are cached, measure the rest, keep each.
+
+    Args:
+        subject: what is evaluated.
+        record: the run, of ``eval`` or ``scale``, that keeps them.
+        remeasure: do not use cached curves; those of this very run, interrupted, are kept.
 
     Returns:
-        The model's path, the entries by method (methods without a model are left out, and said),
-        and where the entries come from, as a text.
-
-    Raises:
-        As :func:`run`.
+        The document of ``eval --json``. Methods without a model are left out, and said.
     """
-    check_methods(tuple(methods))
-    subject = open_subject(settings, screen, checkpoint, dataset)
-    found = {} if remeasure else _cached(subject, methods)
-    if all(method in found for method in subject.measurable(methods)):
-        subject.say_skipped(methods, screen)
-        entries = {method: found[method][0] for method in methods if method in found}
-        return subject.name, entries, _source(found)
-    with Run.create("eval", None, settings.as_dict()) as record:
-        result = record.finish(_evaluate(subject, screen, record, methods, remeasure))
-    return subject.name, result["methods"], result["source"]
+    settings, methods = subject.settings, subject.settings.methods
+    subject.say_skipped(methods, screen)
+    own = record.path(CURVES_FILE)
+    found = {} if remeasure else cached(subject)
+    found |= {name: (entry, own) for name, entry in curves.read(own, subject.digest).items()}
+    keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
+    missing = [name for name in subject.measurable(methods) if name not in found]
+    for name, entry in _measure(subject, screen, missing) if missing else ():
+        for path in keep:
+            curves.write(path, subject.digest, {name: entry})
+        record.event("measured", method=name)
+        found[name] = (entry, own)
+    curves.write(own, subject.digest, {name: entry for name, (entry, _) in found.items()})
+    return {
+        "checkpoint": subject.path,
+        "plant": settings.plant,
+        "seed": settings.seed,
+        "acceptable_score": settings.protocol.acceptable_score,
+        "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
+        "horizon": list(range(settings.protocol.horizon + 1)),
+        "methods": {name: found[name][0] for name in methods if name in found},
+        "skipped": subject.skipped(methods),
+        "curves": own,
+        "source": _source(found),
+    }
+
+
+def cached(subject: Subject) -> dict[str, tuple[Entry, Path]]:
+    """The curves of the settings' methods that were measured before, and where they are."""
+    methods = subject.measurable(subject.settings.methods)
+    return curves.find(subject.digest, methods, subject.beside)
 
 
 def measure_points(
-    settings: Settings,
+    subject: Subject,
     screen: Screen,
     *,
     method: str,
     gaps: Sequence[float] = (),
     probabilities: Sequence[float] = (),
-    checkpoint: str | None = None,
 ) -> list[dict[str, Any]]:
     """Drive all bracket devices at given gaps (steps) or delivery probabilities, now.
 
@@ -175,9 +190,8 @@ def measure_points(
 
     Raises:
         UsageError: the method cannot be measured.
-        As :func:`run` for the checkpoint.
     """
-    subject = open_subject(settings, screen, checkpoint, None)
+    settings = subject.settings
     if method not in subject.methods:
         raise UsageError(
             f"no model for method '{method}'; choose from {', '.join(subject.methods)}",
@@ -202,37 +216,25 @@ def open_subject(
     if model and model.plant_name != settings.plant:
         raise DataError(
             f"model {path} drives plant {model.plant_name}, not {settings.plant}",
-            hint=f"add --plant {model.plant_name} or --preset {model.plant_name}, "
-            "or pass another --checkpoint",
+            hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
         )
     data = load_dataset(dataset, settings.plant) if dataset else None
     return Subject(settings, model, path, data)
 
 
 def show(result: dict[str, Any], screen: Screen) -> None:
-    """Print the table of an evaluation."""
+    """Print the tables of an evaluation: what each method does, and its score over the gap."""
     entries = result["methods"]
     if not entries:
         return
-    windows = [f"{first}-{last}" for first, last in WINDOWS]
-    rows = [
-        [
-            name,
-            *(_number(entry["nmae_windows"].get(window), 3) for window in windows),
-            _number(entry["score"], 3),
-            _number(entry["lq_ratio"], 3),
-            entry["bits_per_transmission"],
-            _tolerance(entry, "gap_steps", "gap", 1, ">"),
-            _tolerance(entry, "p", "p", 4, "<"),
-        ]
-        for name, entry in entries.items()
-    ]
     first = next(iter(entries.values()))
+    windows = [f"{start}-{end}" for start, end in WINDOWS]
+    where = f"{result['plant']}, seed {result['seed']}"
     screen.table(
-        f"{result['plant']}, seed {result['seed']}: NMAE by steps since the packet "
-        f"({first['n_rollouts']} rollouts), score and LQ ratio with every packet "
-        f"({first['n_curve_devices']} devices), tolerances at the acceptable score "
-        f"({first['n_devices']} devices, 95 % CI)",
+        f"{where}: NMAE by steps since the packet ({first['n_rollouts']} rollouts), score and LQ "
+        f"ratio with every packet ({first['n_curve_devices']} devices), tolerances at score "
+        f"{result['acceptable_score']:g} ({first['n_devices']} devices, 95 % CI) and at LQ ratio "
+        f"{result['acceptable_lq_ratio']:g}",
         [
             "method",
             *(f"NMAE {window}" for window in windows),
@@ -241,40 +243,31 @@ def show(result: dict[str, Any], screen: Screen) -> None:
             "bits",
             "gap D* [steps]",
             "delivery p*",
+            "D* by LQ",
         ],
-        rows,
+        [
+            [
+                name,
+                *(_number(entry["nmae_windows"].get(window), 3) for window in windows),
+                _number(entry["score"], 3),
+                _number(entry["lq_ratio"], 3),
+                entry["bits_per_transmission"],
+                _tolerance(entry, "gap_steps", "gap", 1, "≥"),
+                _tolerance(entry, "p", "p", 4, "≤"),
+                _number(entry["tolerance_gap_lq_steps"], 1),
+            ]
+            for name, entry in entries.items()
+        ],
+    )
+    screen.table(
+        f"{where}: score over the gap between packets ({first['n_curve_devices']} devices)",
+        ["method", *(f"{point['d']:g}" for point in first["gap_curve"])],
+        [
+            [name, *(_number(point["score"], 2) for point in entry["gap_curve"])]
+            for name, entry in entries.items()
+        ],
     )
     screen.say(result["source"])
-
-
-def _evaluate(
-    subject: Subject, screen: Screen, record: Run, methods: Sequence[str], remeasure: bool
-) -> dict[str, Any]:
-    """Take what is cached, measure the rest, keep each method as soon as it is done."""
-    settings = subject.settings
-    subject.say_skipped(methods, screen)
-    own = record.path(CURVES_FILE)
-    found = {} if remeasure else _cached(subject, methods)
-    found |= {name: (entry, own) for name, entry in curves.read(own, subject.digest).items()}
-    keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
-    missing = [name for name in subject.measurable(methods) if name not in found]
-    if missing:
-        for name, entry in _measure(subject, screen, missing):
-            for path in keep:
-                curves.write(path, subject.digest, {name: entry})
-            record.event("measured", method=name)
-            found[name] = (entry, own)
-    curves.write(own, subject.digest, {name: entry for name, (entry, _) in found.items()})
-    return {
-        "checkpoint": subject.path,
-        "plant": settings.plant,
-        "seed": settings.seed,
-        "horizon": list(range(settings.protocol.horizon + 1)),
-        "methods": {name: found[name][0] for name in methods if name in found},
-        "skipped": subject.skipped(methods),
-        "curves": own,
-        "source": _source(found),
-    }
 
 
 def _measure(
@@ -353,10 +346,6 @@ def _default_model(settings: Settings, screen: Screen) -> Path | None:
     return None
 
 
-def _cached(subject: Subject, methods: Sequence[str]) -> dict[str, tuple[Entry, Path]]:
-    return curves.find(subject.digest, subject.measurable(methods), subject.beside)
-
-
 def _source(found: dict[str, tuple[Entry, Path]]) -> str:
     paths = ", ".join(dict.fromkeys(str(path) for _, path in found.values()))
     return f"curves of {paths or 'nothing'}; --remeasure measures them again"
@@ -369,10 +358,10 @@ def _how_to_train(method: str, subject: Subject) -> str:
         train += f" --preset {subject.settings.preset}"
     elif subject.settings.plant != "desktop":
         train += f" --plant {subject.settings.plant}"
-    if method.startswith("ts-jepa-") and subject.model is not None:
+    if method.startswith("ts-jepa-") and method != "ts-jepa-1":
         h = int(method.removeprefix("ts-jepa-"))
         return f"{train} --h {h} --m {h // 2 if h % 2 == 0 else 1} --l 1"
-    if method in ("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero"):
+    if method in ("hjepa", "ts-jepa-1", "hold", "zero"):
         return train
     return "no command of this version trains it"
 
@@ -413,12 +402,10 @@ def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
 
 
-def _tolerance(entry: Entry, value_key: str, key: str, decimals: int, beyond: str) -> str | None:
-    """``112.5 [104.1, 118.0]``; ``> 320`` where the score is acceptable to the grid's end."""
+def _tolerance(entry: Entry, value_key: str, key: str, decimals: int, bound: str) -> str | None:
+    """``112.5 (104.1 – 118.0)``; ``≥ 320.0 (…)`` where the score is acceptable to the end."""
     value = entry[f"tolerance_{value_key}"]
     if value is None:
         return None
-    if entry[f"tolerance_{key}_censored"]:
-        return f"{beyond} {value:.{decimals}f}"
-    low, high = entry[f"tolerance_{key}_ci95"]
-    return f"{value:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]"
+    interval = entry[f"tolerance_{key}_ci95"]
+    return span(value, interval, decimals, bound if entry[f"tolerance_{key}_censored"] else "")

@@ -14,9 +14,9 @@ from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.cell import Cell, Need, Row, gain
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import MissingInputError, NumericalError
-from hjepa_cli.screen import Screen
+from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.evaluate import curves_for, measure_points, open_subject
+from hjepa_cli.stages.evaluate import Subject, curves_for, measure_points, open_subject
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
 
@@ -66,29 +66,25 @@ def run(
         raise MissingInputError(
             f"no model for {', '.join(skipped)}", hint=next(iter(skipped.values()))
         )
-    model = None if subject.path is None else str(subject.path)
+    level = settings.protocol.acceptable_score
     with Run.create("scale", out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
             show(record.result, screen)
+            enforce(record.result.get("verify", []), level)
             return record.result
-        _, entries, source = curves_for(
-            settings,
-            screen,
-            methods=settings.methods,
-            checkpoint=model,
-            dataset=dataset,
-            remeasure=remeasure,
-        )
+        measured = curves_for(subject, screen, record, remeasure=remeasure)
         cell = cell_of(settings)
-        needs = [Need.under(cell.law, method, entry) for method, entry in entries.items()]
+        needs = [Need.under(cell.law, *item) for item in measured["methods"].items()]
         rows = [cell.row(need, snr_db) for snr_db in grid_db for need in needs]
         at_db = PAPER_SNR_DB if PAPER_SNR_DB in grid_db else max(grid_db)
         result: dict[str, Any] = {
-            "checkpoint": model,
-            "source": source,
+            "checkpoint": measured["checkpoint"],
+            "source": measured["source"],
             "plant": settings.plant,
-            "acceptable_score": settings.protocol.acceptable_score,
+            "seed": settings.seed,
+            "n_devices": settings.protocol.bracket_devices,
+            "acceptable_score": level,
             "law": cell.law,
             "noise": cell.noise,
             "bandwidth_hz": cell.bandwidth_hz,
@@ -103,11 +99,12 @@ def run(
         result["figures"] = draw(result, record.directory, screen)
         if verify:
             result["verify"] = [
-                check for need in needs for check in verify_need(need, settings, screen, model)
+                check for need in needs for check in verify_need(need, subject, screen)
             ]
+        result = record.finish(result)
         show(result, screen)
-        enforce(result.get("verify", []), settings.protocol.acceptable_score)
-        return record.finish(result)
+        enforce(result.get("verify", []), level)
+        return result
 
 
 def cell_of(settings: Settings) -> Cell:
@@ -117,13 +114,14 @@ def cell_of(settings: Settings) -> Cell:
     return Cell(radio.law, radio.noise, radio.bandwidth_hz, chosen.step_s, limit_bits_per_s)
 
 
-def verify_need(need: Need, settings: Settings, screen: Screen, model: str | None) -> list[Row]:
+def verify_need(need: Need, subject: Subject, screen: Screen) -> list[Row]:
     """Drive a block of loops a little inside and a little outside a tolerance.
 
     The score's interval must lie above the acceptable score inside and below it outside. A side
     is left out where it would be more than a packet in every slot, and the outside where the
     tolerance is only known as a bound.
     """
+    settings = subject.settings
     duty, level = settings.radio.law == "duty", settings.protocol.acceptable_score
     if not need.tolerance or need.tolerance == 1:
         return []
@@ -134,12 +132,11 @@ def verify_need(need: Need, settings: Settings, screen: Screen, model: str | Non
             points.append((share, value, inside))
     values = [value for _, value, _ in points]
     measured = measure_points(
-        settings,
+        subject,
         screen,
         method=need.method,
         gaps=values if duty else (),
         probabilities=() if duty else values,
-        checkpoint=model,
     )
     return [
         {
@@ -157,7 +154,7 @@ def enforce(checks: Sequence[Row], level: float) -> None:
     """Stop where a block of loops does not confirm a tolerance."""
     failed = [
         f"{check['method']} at {check['share_of_tolerance']} x its tolerance scores "
-        f"{_span(check['score'], check['ci95'], 3)}, not clearly {check['expected']} {level:g}"
+        f"{span(check['score'], check['ci95'], 3)}, not clearly {check['expected']} {level:g}"
         for check in checks
         if not check["passed"]
     ]
@@ -204,16 +201,22 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
         by_method.setdefault(row["method"], []).append(row)
     ranked = sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
     duty, level = result["law"] == "duty", result["acceptable_score"]
-    digits, bound = (1, "at least") if duty else (4, "at most")
+    digits, bound = (1, "≥") if duty else (4, "≤")
 
     screen.table(
-        f"one {result['plant']} loop at score {level:g}; "
+        f"one {result['plant']} loop at score {level:g}: seed {result['seed']}, "
+        f"{result['n_devices']} devices, 95 % CI; "
         f"limit λ/ln 2 = {result['limit_bits_per_s']:.1f} bit/s",
         ["method", "gap D* [steps]" if duty else "delivery p*", "bits", "bit/s", "÷limit"],
         [
             [
                 method,
-                _span(row["tolerance"], row["tolerance_ci95"], digits, row["at_least"] and bound),
+                span(
+                    row["tolerance"],
+                    row["tolerance_ci95"],
+                    digits,
+                    bound if row["at_least"] else "",
+                ),
                 row["bits_per_transmission"],
                 None if row["bits_per_s"] is None else f"{row['bits_per_s']:,.0f}",
                 None if row["bits_per_s"] is None else f"{row['ratio_to_limit']:,.0f}",
@@ -228,7 +231,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
             [
                 method,
                 *(
-                    _span(row["devices"], row["devices_ci95"], 0, row["at_least"] and "at least")
+                    span(row["devices"], row["devices_ci95"], 0, "≥" if row["at_least"] else "")
                     for row in rows
                 ),
             ]
@@ -243,7 +246,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
                 [
                     check["method"],
                     f"{check['d' if duty else 'p']:.{digits}f}",
-                    _span(check["score"], check["ci95"], 3),
+                    span(check["score"], check["ci95"], 3),
                     f"{check['expected']} {level:g}",
                     "verified" if check["passed"] else "NOT VERIFIED",
                 ]
@@ -272,14 +275,3 @@ def _described(result: Mapping[str, Any]) -> str:
 
 def _percent(ratio: float | None) -> str:
     return "unbounded" if ratio is None else f"{100 * (ratio - 1):+.1f} %"
-
-
-def _span(
-    value: float | None, interval: Sequence[float] | None, digits: int, bound: str | bool = False
-) -> str | None:
-    """``112.5 (104.1 – 118.0)``, or ``320 (at least)`` where the measured range ended first."""
-    if value is None:
-        return None
-    low, high = interval or (value, value)
-    inside = bound or f"{low:.{digits}f} – {high:.{digits}f}"
-    return f"{value:.{digits}f} ({inside})"

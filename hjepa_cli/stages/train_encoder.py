@@ -39,7 +39,8 @@ from hjepa_cli.storage.runs import Run
 
 STREAM = 2  # this stage's branch of the seed tree
 REJECTED_FILE = "rejected.safetensors"  # what did not pass the gates: nothing trained is lost
-PROBE_EPOCHS = 20  # of the quick probe actor that watches training
+PROBE_EPOCHS = 20  # of the quick probe actor that watches training …
+WATCHED = 80  # … on so many training trajectories: a look must not cost more than it tells
 
 
 def run(
@@ -48,14 +49,17 @@ def run(
     """Train, gate and save an encoder; returns the document of ``--json``.
 
     Raises:
+        UsageError: no such device.
         MissingInputError: no dataset.
         NumericalError: training diverged, or a gate failed (see ``settings.encoder.gate``).
     """
+    resolve_device(settings.device)  # refused before anything is read
     data = open_dataset(dataset, settings)
     recorded = {split: data.split(split) for split in ("train", "test")}
     check_stride(settings.encoder.h, recorded["train"].steps)
     with training_run("train-encoder", out, settings, screen) as record:
         if record.result is not None:
+            show_gates(screen, record.result["gates"])
             return record.result
         started = time.perf_counter()
         torch.manual_seed(settings.seed)
@@ -167,7 +171,12 @@ def train_jepa(
             bar.advance(1, loss=loss.item())
             if (step + 1) % epoch_steps == 0:
                 report = examine(
-                    encoder, companion, train, test, settings, every=math.gcd(4, options.h)
+                    encoder,
+                    companion,
+                    train.slice(0, WATCHED),
+                    test,
+                    settings,
+                    every=math.gcd(4, options.h),
                 )
                 losses = {f"loss_{name}": term.item() for name, term in terms.items()}
                 record.metric({"step": step + 1, **losses, **flatten(report)})

@@ -57,12 +57,13 @@ def run(
     """Train the hierarchy on a frozen encoder; returns the document of ``--json``.
 
     Raises:
-        UsageError: strides that do not nest.
+        UsageError: strides that do not nest, or no such device.
         MissingInputError: no dataset or no encoder.
         DataError: encoder and dataset belong to different plants.
         NumericalError: training diverged.
     """
     strides = Strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
+    resolve_device(settings.device)  # refused before anything is read
     data = open_dataset(dataset, settings)
     recorded = {split: data.split(split) for split in ("train", "test")}
     check_stride(strides.h, recorded["train"].steps)
@@ -70,6 +71,7 @@ def run(
     trained = load_modules(source)
     with training_run("train-hierarchy", out, settings, screen) as record:
         if record.result is not None:
+            show(record.result, screen)
             return record.result
         started = time.perf_counter()
         torch.manual_seed(settings.seed)
@@ -113,11 +115,30 @@ def run(
             "checkpoint": str(path),
             "strides": {"h": strides.h, "m": strides.m, "l": strides.l},
             "seconds": round(time.perf_counter() - started, 2),
+            "health": metadata["health"],
             "nmae_windows": nmae_windows(model, data, settings),
+            "n_rollouts": len(data.split("clean")),
         }
         result = record.finish(result)
+        show(result, screen)
         screen.say(f"model {path} in {result['seconds']:.0f} s; next: hjepa eval")
         return result
+
+
+def show(result: dict[str, Any], screen: Screen) -> None:
+    """What the trained model does without packets, before ``eval`` closes the loop."""
+    windows = result["nmae_windows"]
+    screen.table(
+        f"hjepa alone after one packet: NMAE by steps ({result['n_rollouts']} clean rollouts); "
+        "actor NRMSE and P^H's action sensitivity held out",
+        [*windows, "actor NRMSE", "sensitivity"],
+        [
+            [
+                *(f"{value:.3f}" for value in windows.values()),
+                *(f"{result['health'][key]:.3f}" for key in ("actor_nrmse", "action_sensitivity")),
+            ]
+        ],
+    )
 
 
 def open_encoder(name: str | None, settings: Settings, screen: Screen) -> Checkpoint:

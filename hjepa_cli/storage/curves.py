@@ -51,21 +51,28 @@ class Digest:
     loop_version: int = LOOP_VERSION
 
     @classmethod
-    def of(cls, checkpoint: str | None, settings: Settings, dataset: str | None = None) -> "Digest":
-        """Digest for a checkpoint, the settings that matter, and the dataset behind the NMAE.
+    def of(
+        cls,
+        checkpoint: str | None,
+        settings: Settings,
+        dataset: Mapping[str, Any] | None = None,
+    ) -> "Digest":
+        """Digest for a checkpoint, the settings that matter, and the rollouts behind the NMAE.
 
         Args:
             checkpoint: the model's sha256.
             settings: plant, seed, protocol, embedding and clean rollouts count.
-            dataset: digest of the dataset whose clean rollouts are used, if any.
+            dataset: settings of the dataset whose clean rollouts are used, if any. One that was
+                collected as the settings say gives the same rollouts, and the same digest.
         """
         values = settings.as_dict()
+        source = values if dataset is None else dataset
         measured = {
             "plant": values["plant"],
             "seed": values["seed"],
             "protocol": values["protocol"],
             "embedding": values["encoder"]["embedding"],
-            "clean": dataset or {key: values["collect"][key] for key in _CLEAN},
+            "clean": [source["seed"], *(source["collect"][key] for key in _CLEAN)],
         }
         text = files.canonical_json(measured)
         return cls(checkpoint, hashlib.sha256(text.encode()).hexdigest())
@@ -94,7 +101,7 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
 def find(
     digest: Digest, methods: Iterable[str], places: Iterable[Path], *, root: Path = ROOT
 ) -> dict[str, tuple[Entry, Path]]:
-    """Look for methods in ``places``, then in ``runs/eval/*``, newest first.
+    """Look for methods in ``places``, then in the runs of ``eval`` and ``scale``, newest first.
 
     Returns:
         Entry and the file it came from, for the methods that were found.
@@ -114,7 +121,7 @@ def find(
 
     for path in places:
         take(path)
-    for path in _newest_first(root / "eval") if missing else []:
+    for path in _newest_first(root / "eval", root / "scale") if missing else []:
         with contextlib.suppress(HjepaError):
             take(path)
     return found
@@ -134,9 +141,9 @@ def write(path: Path, digest: Digest, entries: Mapping[str, Entry]) -> None:
     files.write_json(path, document)
 
 
-def _newest_first(stage: Path) -> list[Path]:
-    """The curve files of a stage's runs."""
-    paths = (stage / name / CURVES_FILE for name in files.list_names(stage))
+def _newest_first(*stages: Path) -> list[Path]:
+    """The curve files of these stages' runs."""
+    paths = (stage / name / CURVES_FILE for stage in stages for name in files.list_names(stage))
     return sorted(
         (path for path in paths if path.is_file()),
         key=lambda path: path.stat().st_mtime_ns,

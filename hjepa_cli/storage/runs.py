@@ -40,14 +40,12 @@ class Run:
         directory: where everything is.
         result: the result of a finished run, else ``None``: nothing is left to do.
         resumed: the directory was there before, from an interrupted run.
-        differences: settings in which a finished run differs from what was asked now.
     """
 
     def __init__(self, directory: Path, lock: IO[bytes]) -> None:
         self.directory = directory
         self.result: dict[str, Any] | None = None
         self.resumed = False
-        self.differences: list[str] = []
         self._lock = lock
 
     @classmethod
@@ -63,7 +61,7 @@ class Run:
             root: the parent of the automatic directories.
 
         Raises:
-            UsageError: ``out`` holds something else, or an interrupted run with other settings.
+            UsageError: ``out`` holds something else, or a run with other settings.
             LockedError: another process works in it.
             StorageError: not writable.
         """
@@ -128,16 +126,18 @@ class Run:
     def _open(self, stage: str, settings: Mapping[str, Any]) -> None:
         if self.path(CONFIG).exists():
             self.resumed = True
-            self.differences = _differences(read_config(self.directory), settings)
-            if self.path(RESULT).exists():
+            finished = self.path(RESULT).exists()
+            differences = _differences(read_config(self.directory), settings)
+            if differences:
+                raise UsageError(
+                    f"{self.directory} holds {'a finished' if finished else 'an unfinished'} run "
+                    f"with other settings: {'; '.join(differences)}",
+                    hint=f"repeat its own settings to {'see' if finished else 'continue'} it, "
+                    "or choose another --out DIR",
+                )
+            if finished:
                 self.result = files.read_json(self.path(RESULT))
                 return
-            if self.differences:
-                raise UsageError(
-                    f"{self.directory} holds an unfinished run with other settings: "
-                    + "; ".join(self.differences),
-                    hint="repeat its own settings to continue it, or choose another --out DIR",
-                )
             for name in (METRICS, EVENTS):
                 if self.path(name).exists():  # a kill may have cut the last line
                     files.write_text(self.path(name), "".join(_whole_lines(self.path(name))))
