@@ -174,7 +174,12 @@ def build_loops(settings: Settings) -> dict[str, Loop]:
     )
     update = optimiser(jepa.parameters())
     windows = FrameWindows(
-        frames, actions, window_frames=options.batch_frames, stride=options.h, mirror=options.mirror
+        frames,
+        actions,
+        window_frames=options.batch_frames,
+        stride=options.h,
+        mirror=options.mirror,
+        shift_px=options.shift_px,
     )
     stream = np.random.default_rng(0)
     preloaded = windows.draw(count, stream)

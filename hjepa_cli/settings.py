@@ -63,6 +63,7 @@ class EncoderSettings:
     ema_decay: float
     inverse_dynamics: float
     mirror: bool
+    shift_px: int
     precision: Literal["auto", "bf16", "fp32"]
     gate: bool
     gate_r2_x: float

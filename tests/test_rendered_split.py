@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.methods import embedding_sensor
+from hjepa_cli.core.plant import plant
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
 from hjepa_cli.stages.inputs import CHUNK, RenderedSplit, embed, render
@@ -101,6 +102,41 @@ def test_training_batches_hold_the_same_pairs(split: RenderedSplit, mirror: bool
         assert torch.equal(played.flatten(), sign * actions[i : i + 8])
         signs.add(sign)
     assert signs == ({1.0, -1.0} if mirror else {1.0})
+
+
+def alike(one: Tensor, other: Tensor) -> bool:
+    """Equal but for rounding: x in float32 plus a shift moves a value by one at times."""
+    return bool((one.int() - other.int()).abs().max() <= 1)
+
+
+def test_shifted_windows_are_what_the_camera_sees_elsewhere_on_the_track(
+    recorded: Trajectories, split: RenderedSplit
+) -> None:
+    """Against the camera: the same states, so many pixels to the side."""
+    windows = FrameWindows(
+        split.frames, split.actions, window_frames=3, stride=4, mirror=False, shift_px=2
+    )
+    batch = windows.draw(12, np.random.default_rng(1))
+    pixel_m = plant("desktop").window_m[0] / 128
+    seen = set()
+    known = {}
+    for shift_px in range(-2, 3):
+        states = recorded.states.astype(float)
+        states[..., 0] += shift_px * pixel_m
+        pairs = np.stack([states[:, :-1], states[:, 1:]], axis=2).reshape(-1, 2, 4)
+        known[shift_px] = pictures(pairs)
+    actions = split.actions.flatten()
+    for window, played in zip(batch.frames.unflatten(0, (12, 3)), batch.actions, strict=True):
+        ((shift_px, i),) = [
+            (shift_px, i)
+            for shift_px, there in known.items()
+            for i in range(len(there))
+            if alike(there[i], window[0])
+        ]
+        assert alike(known[shift_px][i : i + 9 : 4], window)
+        assert torch.equal(played.flatten(), actions[i : i + 8])
+        seen.add(shift_px)
+    assert len(seen) >= 4
 
 
 def test_the_closed_loop_encodes_the_same_pairs(

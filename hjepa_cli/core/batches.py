@@ -51,6 +51,9 @@ class FrameWindows:
         window_frames, stride: F and the control steps between frames.
         mirror: flip half of the windows left to right and negate their actions, which is exact
             physics and doubles the data.
+        shift_px: move every window sideways by −shift_px … shift_px whole pixels, the same for all
+            its frames. Exact physics as well, as long as nothing leaves the picture: the same
+            motion elsewhere on the track.
     """
 
     def __init__(
@@ -61,11 +64,12 @@ class FrameWindows:
         window_frames: int,
         stride: int,
         mirror: bool,
+        shift_px: int = 0,
     ) -> None:
         self.frames, self.actions = frames, actions
         self.steps = actions.shape[1]
         self.window_frames = min(window_frames, (self.steps - 1) // stride + 1)
-        self.stride, self.mirror = stride, mirror
+        self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
 
     def draw(self, count: int, generator: np.random.Generator) -> TrajectoryBatch:
         """``count`` windows from trajectories drawn without replacement where they suffice."""
@@ -81,4 +85,18 @@ class FrameWindows:
             flipped = torch.from_numpy(generator.random(count) < 0.5)
             pairs[flipped] = pairs[flipped].flip(-2)
             actions = torch.where(flipped[:, None, None], -actions, actions)
+        if self.shift_px:
+            shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)
+            for window, shift_px in zip(pairs, shifts, strict=True):
+                window.copy_(shift_sideways(window, int(shift_px)))
         return TrajectoryBatch(pairs.flatten(0, 1), actions)
+
+
+def shift_sideways(frames: Tensor, shift_px: int) -> Tensor:
+    """Frames [..., H, W, 3] moved right by ``shift_px`` (left: negative), edge columns repeated.
+
+    The scene is the same all along the track, so this is what the camera would have seen.
+    """
+    width = frames.shape[-2]
+    columns = torch.clamp(torch.arange(width) - shift_px, 0, width - 1)
+    return frames.index_select(-2, columns)

@@ -155,6 +155,7 @@ def train_jepa(
         window_frames=options.batch_frames,
         stride=options.h,
         mirror=options.mirror,
+        shift_px=options.shift_px,
     )
     stream = generator(settings.seed, STREAM)
     frames_per_epoch = train.actions.numel()
