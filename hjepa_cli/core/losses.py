@@ -10,7 +10,12 @@ def cosine_loss(predicted: Tensor, target: Tensor) -> Tensor:
 
     The paper prints arg min of the cosine itself (eq. 7), a sign slip.
     """
-    return 1.0 - F.cosine_similarity(predicted, target.detach(), dim=-1).mean()
+    return 1.0 - cosine_similarity(predicted, target).mean()
+
+
+def cosine_similarity(predicted: Tensor, target: Tensor) -> Tensor:
+    """cos(z̃, sg(z)) of embeddings [..., D] → [...]; no gradient reaches the target."""
+    return F.cosine_similarity(predicted, target.detach(), dim=-1)
 
 
 class InverseDynamics(nn.Module):
