@@ -134,13 +134,20 @@ def test_rollouts_reach_their_targets(stride: int, monkeypatch: pytest.MonkeyPat
     def compare(predicted: Tensor, target: Tensor) -> Tensor:
         assert torch.equal(predicted, target)
         reached.append(target[..., 1])
-        return torch.zeros(())
+        return torch.arange(float(target.shape[1])).expand(len(target), -1)
 
-    monkeypatch.setattr(hierarchy, "cosine_loss", compare)
+    monkeypatch.setattr(hierarchy, "cosine_similarity", compare)
     starts = torch.tensor([0, 1, frames // 2]).unique()
     horizon = max(80 // stride, 1)
-    rollout_loss(Clock(stride), z, z, actions, starts, horizon)
-    first = torch.stack([target[:, 0] for target in reached], dim=1)
+    loss = rollout_loss(Clock(stride), z, z, actions, starts, horizon)
+    running = [int((starts + step < frames).sum()) for step in range(1, horizon + 1)]
+    running = [count for count in running if count]
+    ((targets,),) = [reached]
+    by_step = targets.split(running, dim=1)
+    first = torch.stack([step[:, 0] for step in by_step], dim=1)
+    # Every step weighs the same, however many starts are still running.
+    places = np.split(np.arange(sum(running)), np.cumsum(running)[:-1])
+    assert loss.item() == pytest.approx(1 - np.mean([place.mean() for place in places]))
     expected = k[:, :1] + stride * torch.arange(1, min(horizon, frames - 1) + 1)
     assert torch.equal(first, expected.float())
 

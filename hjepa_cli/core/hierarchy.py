@@ -72,7 +72,7 @@ def rollout_loss(
         reached.append(targets[:, now + 1])
     # One loss over all steps, split afterwards: many small losses cost a fifth of the training.
     similarity = cosine_similarity(torch.cat(predicted, dim=1), torch.cat(reached, dim=1))
-    by_step = similarity.split([state.shape[1] for state in predicted], dim=1)
+    by_step = torch.split(similarity, [state.shape[1] for state in predicted], dim=1)
     return 1.0 - torch.stack([step.mean() for step in by_step]).mean()
 
 
