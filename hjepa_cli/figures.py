@@ -75,7 +75,7 @@ def devices_figure(
 
     Args:
         rows: of ``scale --json``: ``snr_db``, ``method``, ``devices``, ``devices_ci95``. Methods
-            that support nobody anywhere are named in the legend only.
+            that support nobody anywhere are named in the legend only; ``at_least`` is, too.
         title: one line above the axes.
         snr_label: what the SNR is under the law.
     """
@@ -83,8 +83,11 @@ def devices_figure(
         figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
         axes = figure.add_subplot()
         curves = _curves(rows)
+        bounds = {row["method"] for row in rows if row.get("at_least")}
         for method, points in sorted(curves.items(), key=lambda item: -item[1][-1, 1]):
-            _draw(axes, method, points, _style(method, list(curves)))
+            label = method if points[:, 1].any() else f"{method} (0)"
+            label += " (at least)" if method in bounds else ""
+            _draw(axes, label, points, _style(method, list(curves)))
         _scale_counts(axes, [row for row in rows if row["devices"]])
         axes.set_xlabel(snr_label)
         axes.set_ylabel("Supported devices")
@@ -124,9 +127,8 @@ def _style(method: str, methods: list[str]) -> Style:
     return STYLES.get(method) or OTHERS[others.index(method) % len(OTHERS)]
 
 
-def _draw(axes: Axes, method: str, points: np.ndarray, style: Style) -> None:
+def _draw(axes: Axes, label: str, points: np.ndarray, style: Style) -> None:
     snr_db, devices, low, high = points.T
-    label = method if devices.any() else f"{method} (0)"
     axes.plot(
         snr_db,
         np.where(devices > 0, devices, np.nan),

@@ -160,3 +160,9 @@ def test_no_global_state_is_left_behind():
     assert (
         "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
     )
+
+
+def test_bounds_are_named_as_such() -> None:
+    measured = [{**row, "at_least": row["method"] == "oracle"} for row in rows()]
+    assert "oracle (at least)" in lines(figures.devices_figure(measured))
+    assert "hjepa" in lines(figures.devices_figure(measured))
