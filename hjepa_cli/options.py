@@ -123,6 +123,9 @@ Checkpoint = Annotated[
     ),
 ]
 
+RunDirectory = Annotated[
+    Path, typer.Argument(help="The run's directory.", metavar="RUN", show_default=False)
+]
 ModelName = Annotated[
     str, typer.Argument(help="A zoo name or a path.", metavar="NAME|PATH", show_default=False)
 ]

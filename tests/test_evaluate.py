@@ -30,7 +30,7 @@ from hjepa_cli.core.policy import teacher
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import BLOCK_DEVICES, Block, Simulator, Tick, run_points
 from hjepa_cli.core.workers import Workers
-from hjepa_cli.errors import DataError, MissingInputError, NumericalError, UsageError
+from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import evaluate
@@ -196,7 +196,7 @@ def test_an_interrupted_run_continues_after_the_last_method(
         return entry(bench, method)
 
     monkeypatch.setattr(Bench, "entry", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Interrupted, match="interrupted"):
         evaluate.run(settings, Output().screen, checkpoint=str(checkpoint), out=out, remeasure=True)
     measured.clear()
     result = evaluate.run(

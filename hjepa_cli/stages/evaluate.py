@@ -76,6 +76,15 @@ class Subject:
             self.dataset.settings if self.dataset else None,
         )
 
+    def inputs(self, **flags: bool) -> dict[str, Any]:
+        """What a run of this subject was given, for :meth:`Run.create`."""
+        given: dict[str, Any] = dict(flags)
+        if self.model and self.path:
+            given["checkpoint"] = runs.describe_input(self.path, self.model.digest)
+        if self.dataset:
+            given["dataset"] = runs.describe_input(self.dataset.path, self.dataset.digest)
+        return given
+
     @property
     def beside(self) -> list[Path]:
         """Where the model's own curves are; the zoo's are never written, a run's are."""
@@ -118,7 +127,8 @@ def run(
     """
     check_methods(settings.methods)
     subject = open_subject(settings, screen, checkpoint, dataset)
-    with Run.create("eval", out, settings.as_dict()) as record:
+    inputs = subject.inputs(remeasure=remeasure)
+    with Run.create("eval", out, settings.as_dict(), inputs) as record:
         result = record.result
         if result is None:
             result = record.finish(curves_for(subject, screen, record, remeasure=remeasure))
