@@ -205,6 +205,8 @@ def collect(
     config: options.Config = None,
     plant: options.PlantName = None,
     seed: options.Seed = None,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     dry_run: options.DryRun = False,
@@ -226,9 +228,11 @@ def collect(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
+        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.collect import run
 
-        return run(settings, screen, out=out)
+        with placed(workers, cluster):
+            return run(settings, screen, out=out)
 
     _execute(
         screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run, product="dataset"
@@ -342,6 +346,8 @@ def evaluate(
     plant: options.PlantName = None,
     seed: options.Seed = None,
     device: options.Device = None,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     dry_run: options.DryRun = False,
@@ -363,11 +369,18 @@ def evaluate(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
+        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.evaluate import run
 
-        return run(
-            settings, screen, checkpoint=checkpoint, dataset=dataset, out=out, remeasure=remeasure
-        )
+        with placed(workers, cluster):
+            return run(
+                settings,
+                screen,
+                checkpoint=checkpoint,
+                dataset=dataset,
+                out=out,
+                remeasure=remeasure,
+            )
 
     _execute(
         screen,
@@ -396,6 +409,8 @@ def scale(
     plant: options.PlantName = None,
     seed: options.Seed = None,
     device: options.Device = None,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     dry_run: options.DryRun = False,
@@ -425,17 +440,19 @@ def scale(
         snr_db = parse_snr(settings.radio.snr_db)
 
     def stage() -> Result:
+        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.scale import run
 
-        return run(
-            settings,
-            screen,
-            checkpoint=checkpoint,
-            dataset=dataset,
-            out=out,
-            remeasure=remeasure,
-            verify=verify,
-        )
+        with placed(workers, cluster):
+            return run(
+                settings,
+                screen,
+                checkpoint=checkpoint,
+                dataset=dataset,
+                out=out,
+                remeasure=remeasure,
+                verify=verify,
+            )
 
     _execute(
         screen,
@@ -450,6 +467,8 @@ def scale(
 @app.command(rich_help_panel=PIPELINE)
 def resume(
     directory: options.RunDirectory,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
@@ -458,9 +477,11 @@ def resume(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
+        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.resume import run
 
-        return run(directory, screen)
+        with placed(workers, cluster):
+            return run(directory, screen)
 
     _execute(screen, stage)
 

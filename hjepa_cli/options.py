@@ -286,6 +286,27 @@ Device = Annotated[
     _one_of(SETTINGS, "--device", "Where to compute; auto: cuda if there.", "auto", "cpu", "cuda"),
 ]
 
+Workers = Annotated[
+    int | None,
+    _plain(
+        SETTINGS,
+        "--workers",
+        "Processes to work in; 0: this one alone. Without it: as many cores as are worth it. "
+        "Results are the same.",
+        metavar="N",
+        parser=whole_number(0),
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    _plain(
+        SETTINGS,
+        "--cluster",
+        "Work on a Dask cluster: the scheduler's address, its JSON file, or local to start one.",
+        metavar="ADDRESS|FILE|local",
+    ),
+]
+
 # --- screen
 
 Json = Annotated[

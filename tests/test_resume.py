@@ -101,6 +101,20 @@ def signal_after(monkeypatch: pytest.MonkeyPatch, steps: int, number: int = sign
     monkeypatch.setattr(Optimiser, "step", step)
 
 
+def crash_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    """Let the step after ``steps`` fail, as a bug or a lack of memory would."""
+    update, seen = Optimiser.step, 0
+
+    def step(self: Optimiser, loss: torch.Tensor, index: int) -> None:
+        nonlocal seen
+        seen += 1
+        if seen > steps:
+            raise RuntimeError("crash")
+        update(self, loss, index)
+
+    monkeypatch.setattr(Optimiser, "step", step)
+
+
 def skip_actor(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fit no actor with the counted optimiser: only steps of the loops count."""
     for module in (train_encoder, train_hierarchy):
@@ -156,16 +170,7 @@ def test_a_stop_between_saves_repeats_what_was_lost(
     for steps in (1, 2, 2):
         with monkeypatch.context() as patched:
             skip_actor(patched)
-            update, seen = Optimiser.step, 0
-
-            def crash(self: Optimiser, loss: torch.Tensor, index: int, stop: int = steps) -> None:
-                nonlocal seen
-                seen += 1
-                if seen > stop:
-                    raise RuntimeError("crash")
-                update(self, loss, index)
-
-            patched.setattr(Optimiser, "step", crash)
+            crash_after(patched, steps)
             patched.setattr(progress, "SAVE_EVERY_S", next(every_s))
             with pytest.raises(RuntimeError, match="crash"):
                 train(out)
@@ -333,7 +338,7 @@ def test_a_diverging_run_saves_nothing_that_is_not_finite(
 
     monkeypatch.setattr(Jepa, "total", poisoned)
     monkeypatch.setattr(progress, "SAVE_EVERY_S", 0.0)
-    with pytest.raises(NumericalError, match="diverged at step 2 .*learning rate") as caught:
+    with pytest.raises(NumericalError, match=r"diverged at step 2 .*learning rate") as caught:
         trainer("train-encoder", workplace)(out)
     assert caught.value.exit_code == 70
     assert not (out / "model.safetensors").exists()

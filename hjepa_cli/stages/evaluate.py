@@ -13,6 +13,7 @@ from typing import Any
 
 from hjepa_cli.checks import TRUE_STATE, check_methods
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
+from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
 from hjepa_cli.core.loop import Floats
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import WINDOWS
@@ -21,7 +22,7 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.trajectories import generate
-from hjepa_cli.core.workers import MAX_WORKERS, Workers, cores
+from hjepa_cli.core.workers import cluster_runner, open_workers, single_thread
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
@@ -315,11 +316,19 @@ def _measure(
 def _runner(subject: Subject) -> Iterator[Runner]:
     """Simulate in one process per core, or in this one where that is enough."""
     settings, count = subject.settings, min(cores(), MAX_WORKERS)
-    if count > 1 and _device_steps(settings) >= WORTH_WORKERS:
-        with Workers(settings, subject.path, count) as workers:
+    where = placement()
+    if where.workers is None:
+        several = count > 1 and _device_steps(settings) >= WORTH_WORKERS
+    else:
+        count, several = where.workers, where.workers > 0
+    if where.cluster is not None:
+        with open_cluster(where.cluster, count or cores()) as (executor, _):
+            yield cluster_runner(executor, settings, subject.path)
+    elif several:
+        with open_workers(settings, subject.path, count) as workers:
             yield workers
     else:
-        yield Simulator(settings, subject.model)
+        yield single_thread(Simulator(settings, subject.model))
 
 
 def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:

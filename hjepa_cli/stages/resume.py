@@ -10,7 +10,9 @@ from hjepa_cli.checks import check_settings
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
+from hjepa_cli.storage.datasets import MANIFEST, load_dataset
 from hjepa_cli.storage.runs import CONFIG, read_environment
+from hjepa_cli.storage.shards import LOG, read_task
 
 
 def run(directory: Path, screen: Screen) -> dict[str, Any]:
@@ -26,6 +28,8 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
     """
     if not directory.is_dir():
         raise MissingInputError(f"run {directory} does not exist", hint="ls runs/*")
+    if (directory / LOG).exists() or (directory / MANIFEST).exists():
+        return _collect(directory, screen)
     recorded = read_environment(directory)
     stage, inputs = recorded["stage"], recorded["inputs"]
     settings = load_settings(_preset(recorded, directory), directory / CONFIG)
@@ -67,6 +71,21 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
             verify=bool(inputs.get("verify")),
         )
     raise DataError(f"{directory} holds a run of '{stage}', which this hjepa does not know")
+
+
+def _collect(directory: Path, screen: Screen) -> dict[str, Any]:
+    from hjepa_cli.stages import collect
+
+    if (directory / MANIFEST).exists():
+        screen.say(f"{directory} holds a finished dataset")
+        return collect.describe(load_dataset(directory), 0.0, None)
+    task = read_task(directory)
+    flags = {key: value for key, value in task.items() if key != "preset"}
+    for section in [key for key, value in flags.items() if isinstance(value, dict)]:
+        flags |= {f"{section}.{key}": value for key, value in flags.pop(section).items()}
+    settings = load_settings(_preset(task, directory), None, flags)
+    check_settings(settings)
+    return collect.run(settings, screen, out=directory)
 
 
 def _preset(recorded: dict[str, Any], directory: Path) -> str | None:

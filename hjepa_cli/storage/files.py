@@ -12,6 +12,7 @@ import json
 import math
 import os
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -223,6 +224,16 @@ def storage_error(path: Path, error: OSError) -> StorageError:
     else:
         hint = "choose a directory that you may write to with --out DIR"
     return StorageError(f"cannot write {path}: {error.strerror or error}", hint=hint)
+
+
+def check_free_space(directory: Path, size_bytes: int) -> None:
+    """Refuse to begin what the disk cannot hold. Raises StorageError."""
+    free_bytes = shutil.disk_usage(directory).free
+    if free_bytes < size_bytes:
+        raise StorageError(
+            f"{directory} has {free_bytes / 1e9:.1f} GB free; {size_bytes / 1e9:.1f} GB are needed",
+            hint="free some disk space, or choose another disk with --out DIR",
+        )
 
 
 def point_to(command: str, error: BaseException | None) -> None:
