@@ -188,13 +188,14 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
     Raises:
         UsageError: no scheduler answers at ``where``.
     """
-    from distributed import Client, LocalCluster
+    import distributed
 
+    dask: Any = distributed  # it has no types
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # a lost worker is no news here
     with anonymous_main():
         if where == LOCAL:
             target: dict[str, Any] = {
-                "address": LocalCluster(
+                "address": dask.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
                     dashboard_address=None,
@@ -204,7 +205,7 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
         else:
             target = {"scheduler_file": where} if Path(where).is_file() else {"address": where}
         try:
-            client = Client(**target, timeout=CONNECT_S, set_as_default=False)
+            client = dask.Client(**target, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise UsageError(
                 f"--cluster {where}: no Dask scheduler answers ({error or 'timeout'})",

@@ -219,7 +219,7 @@ def read_config(directory: Path) -> dict[str, Any]:
     path = directory / CONFIG
     try:
         return tomllib.loads(files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid TOML: {error}") from None
 
 

@@ -17,7 +17,7 @@ from hjepa_cli.errors import DataError, HjepaError, UsageError
 from hjepa_cli.storage import files
 
 LOG = "collecting.jsonl"
-NAME = re.compile(r"shard-\d{5,}\.safetensors")
+NAME = re.compile(r"shard-\d{5,9}\.safetensors")
 
 Described = dict[str, Any]
 
