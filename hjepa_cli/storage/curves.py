@@ -88,8 +88,9 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
     if not path.exists():
         return {}
     document = files.read_json(path)
-    if document.get("schema") != SCHEMA or not isinstance(document.get("methods"), dict):
-        raise _damaged(path, f"schema {document.get('schema')!r}, expected {SCHEMA}")
+    files.check_schema(document.get("schema"), SCHEMA, str(path))
+    if not isinstance(document.get("methods"), dict):
+        raise _damaged(path, "no methods")
     if document.get("digest") != dataclasses.asdict(digest):
         return {}
     for name, entry in document["methods"].items():
