@@ -168,7 +168,8 @@ class Model:
             DataError: not an intact hierarchy checkpoint.
         """
         checkpoint = load_checkpoint(path)
-        if check_metadata(checkpoint)["architecture"]["kind"] != "hierarchy":
+        architecture = checkpoint.metadata.get("architecture")
+        if isinstance(architecture, dict) and architecture.get("kind") == "encoder":
             raise DataError(
                 f"{path} is a checkpoint of train-encoder, not of train-hierarchy",
                 hint=f"hjepa train-hierarchy --encoder {path}",

@@ -172,8 +172,12 @@ def _is_count(value: object) -> bool:
     return type(value) is int and 0 < value <= LARGEST
 
 
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool)
+
+
 def _is_tolerance(value: object) -> bool:
-    return value is None or (_is_number(value) and value > 0)  # type: ignore[operator]
+    return value is None or (_is_number(value) and value >= 0)  # type: ignore[operator]
 
 
 def _is_numbers(value: object) -> bool:
@@ -211,11 +215,11 @@ _CHECKS: dict[str, Check] = {
     "delivery_curve": _is_curve,
     "tolerance_gap_steps": _is_tolerance,
     "tolerance_gap_ci95": _or_none(_is_interval),
-    "tolerance_gap_censored": lambda value: isinstance(value, bool),
+    "tolerance_gap_censored": _or_none(_is_flag),
     "tolerance_gap_lq_steps": _is_tolerance,
     "tolerance_p": _is_tolerance,
     "tolerance_p_ci95": _or_none(_is_interval),
-    "tolerance_p_censored": lambda value: isinstance(value, bool),
+    "tolerance_p_censored": _or_none(_is_flag),
     "bits_per_transmission": lambda value: value is None or _is_count(value),
     "n_devices": _is_count,
     "n_curve_devices": _is_count,
