@@ -19,7 +19,8 @@ from typer.main import get_command
 
 from hjepa_cli import __version__, options, plan
 from hjepa_cli.checks import check_settings
-from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
+from hjepa_cli.errors import DataError, HjepaError, Interrupted, StorageError, UsageError
+from hjepa_cli.interrupts import exit_code, sigterm_raises
 from hjepa_cli.screen import Screen, one_line
 from hjepa_cli.settings import Settings, load_settings
 
@@ -35,12 +36,6 @@ app = typer.Typer(
 )
 models_app = typer.Typer(help="List, describe and verify trained models.")
 app.add_typer(models_app, name="models", rich_help_panel="Models")
-
-
-class Interrupted(HjepaError):
-    """Ctrl-C."""
-
-    exit_code = 130
 
 
 class PipeClosed(HjepaError):
@@ -155,12 +150,11 @@ def _execute(
 def _guard() -> Iterator[None]:
     """Catch what Typer would turn into exit codes of its own."""
     try:
-        yield
-    except KeyboardInterrupt:
+        with sigterm_raises():
+            yield
+    except KeyboardInterrupt as error:
         raise Interrupted(
-            "interrupted",
-            hint="the same command with --out and its run directory takes it up; "
-            "a training stage starts over",
+            "interrupted", hint="run the same command again", code=exit_code(error)
         ) from None
     except BrokenPipeError:
         raise PipeClosed("output closed") from None
@@ -211,6 +205,8 @@ def collect(
     config: options.Config = None,
     plant: options.PlantName = None,
     seed: options.Seed = None,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     dry_run: options.DryRun = False,
@@ -232,9 +228,11 @@ def collect(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
+        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.collect import run
 
-        return run(settings, screen, out=out)
+        with placed(workers, cluster):
+            return run(settings, screen, out=out)
 
     _execute(
         screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run, product="dataset"
@@ -348,6 +346,8 @@ def evaluate(
     plant: options.PlantName = None,
     seed: options.Seed = None,
     device: options.Device = None,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     dry_run: options.DryRun = False,
@@ -369,11 +369,18 @@ def evaluate(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
+        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.evaluate import run
 
-        return run(
-            settings, screen, checkpoint=checkpoint, dataset=dataset, out=out, remeasure=remeasure
-        )
+        with placed(workers, cluster):
+            return run(
+                settings,
+                screen,
+                checkpoint=checkpoint,
+                dataset=dataset,
+                out=out,
+                remeasure=remeasure,
+            )
 
     _execute(
         screen,
@@ -402,6 +409,8 @@ def scale(
     plant: options.PlantName = None,
     seed: options.Seed = None,
     device: options.Device = None,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     dry_run: options.DryRun = False,
@@ -431,17 +440,19 @@ def scale(
         snr_db = parse_snr(settings.radio.snr_db)
 
     def stage() -> Result:
+        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.scale import run
 
-        return run(
-            settings,
-            screen,
-            checkpoint=checkpoint,
-            dataset=dataset,
-            out=out,
-            remeasure=remeasure,
-            verify=verify,
-        )
+        with placed(workers, cluster):
+            return run(
+                settings,
+                screen,
+                checkpoint=checkpoint,
+                dataset=dataset,
+                out=out,
+                remeasure=remeasure,
+                verify=verify,
+            )
 
     _execute(
         screen,
@@ -451,6 +462,28 @@ def scale(
         ),
         dry_run=dry_run,
     )
+
+
+@app.command(rich_help_panel=PIPELINE)
+def resume(
+    directory: options.RunDirectory,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Take up an interrupted run: same settings, same inputs, same result."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.core.executors import placed
+        from hjepa_cli.stages.resume import run
+
+        with placed(workers, cluster):
+            return run(directory, screen)
+
+    _execute(screen, stage)
 
 
 @models_app.callback(invoke_without_command=True)

@@ -55,3 +55,18 @@ class LockedError(HjepaError):
     """Another process works in the same run directory."""
 
     exit_code = 75
+
+
+class Interrupted(HjepaError):
+    """Ctrl-C or SIGTERM; nothing is lost.
+
+    Args:
+        message, hint: as for :class:`HjepaError`.
+        code: 128 + the signal's number.
+    """
+
+    exit_code = 130
+
+    def __init__(self, message: str, *, hint: str | None = None, code: int = 130) -> None:
+        super().__init__(message, hint=hint)
+        self.exit_code = code

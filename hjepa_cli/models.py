@@ -72,7 +72,9 @@ def verify(screen: Screen, names: list[str]) -> Result:
 
 
 def _summary(model: ZooModel) -> Result:
-    architecture = model.metadata.get("architecture", {})
+    architecture = model.metadata.get("architecture")
+    if not isinstance(architecture, dict):
+        raise DataError(f"{model.path} does not say what it is: no architecture")
     return {
         "name": model.name,
         "path": str(model.path),

@@ -123,6 +123,9 @@ Checkpoint = Annotated[
     ),
 ]
 
+RunDirectory = Annotated[
+    Path, typer.Argument(help="The run's directory.", metavar="RUN", show_default=False)
+]
 ModelName = Annotated[
     str, typer.Argument(help="A zoo name or a path.", metavar="NAME|PATH", show_default=False)
 ]
@@ -281,6 +284,27 @@ Seed = Annotated[int | None, _count(SETTINGS, "--seed", "Seed of everything rand
 Device = Annotated[
     str | None,
     _one_of(SETTINGS, "--device", "Where to compute; auto: cuda if there.", "auto", "cpu", "cuda"),
+]
+
+Workers = Annotated[
+    int | None,
+    _plain(
+        SETTINGS,
+        "--workers",
+        "Processes to work in; 0: this one alone. Without it: as many cores as are worth it. "
+        "Results are the same.",
+        metavar="N",
+        parser=whole_number(0),
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    _plain(
+        SETTINGS,
+        "--cluster",
+        "Work on a Dask cluster: the scheduler's address, its JSON file, or local to start one.",
+        metavar="ADDRESS|FILE|local",
+    ),
 ]
 
 # --- screen

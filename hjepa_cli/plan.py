@@ -72,6 +72,8 @@ def plan_collect(settings: Settings, out: Path | None) -> Plan:
     trajectories = options.trajectories + options.test_trajectories
     steps = trajectories * options.steps + options.clean_trajectories * options.clean_steps
     frames = steps + trajectories + options.clean_trajectories
+    from hjepa_cli.storage.datasets import per_shard
+
     stored = options.frames == "stored"
     work = [
         f"simulate {options.trajectories} training, {options.test_trajectories} held-out and "
@@ -79,13 +81,15 @@ def plan_collect(settings: Settings, out: Path | None) -> Plan:
     ]
     if stored:
         work.append(f"render {frames} frames of 64 x 128 RGB")
+    sizes = (options.trajectories, options.test_trajectories, options.clean_trajectories)
+    shards = sum(-(-size // per_shard(stored)) for size in sizes)
     return Plan(
         command="collect",
         reads=[],
         work=work,
-        writes=[f"dataset {out or f'data/{settings.plant}-<next number>'}"],
+        writes=[f"dataset {out or f'data/{settings.plant}-<next number>'} in {shards} shards"],
         writes_bytes=frames * (16 + (FRAME_BYTES if stored else 0)) + steps * 8,
-        seconds=2 + _seconds({"simulated steps": steps, "rendered frames": frames}),
+        seconds=2 + _seconds({"simulated steps": steps, "rendered frames": frames * stored}),
     )
 
 

@@ -8,6 +8,7 @@ presets, ``--config FILE.toml`` and flags override single values of it. Preceden
 import dataclasses
 import difflib
 import math
+import sys
 import tomllib
 import typing
 from collections.abc import Mapping
@@ -19,6 +20,7 @@ from hjepa_cli.errors import DataError, MissingInputError, UsageError
 
 T = typing.TypeVar("T")
 
+CONFIG_LIMIT_BYTES = 2**20
 PRESETS = ("default", "paper", "gym", "smoke")
 
 
@@ -210,10 +212,14 @@ def _read_preset(name: str) -> dict[str, Any]:
 
 def _read_config(path: Path) -> dict[str, Any]:
     try:
+        if path.stat().st_size > CONFIG_LIMIT_BYTES:
+            raise DataError(f"config file {path} is larger than {CONFIG_LIMIT_BYTES} bytes")
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise MissingInputError(f"config file {path} does not exist") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except RecursionError:
+        raise DataError(f"config file {path} is nested too deeply") from None
+    except (OSError, ValueError) as error:
         raise DataError(f"config file {path} is not readable TOML: {error}") from None
 
 
@@ -254,7 +260,7 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
             raise UsageError(f"{name} = {value!r}; expected a list")
         return tuple(_convert(item, entry, name) for entry in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        value = float(value) if abs(value) <= sys.float_info.max else math.inf
     if type(value) is not hint:
         raise UsageError(f"{name} = {value!r}; expected {hint.__name__}")
     if hint is float and not math.isfinite(value):

@@ -1,5 +1,6 @@
 """``hjepa eval`` end to end on an untrained model, its cache, and the ceilings of the protocol."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -18,6 +19,7 @@ import pytest
 import torch
 
 from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.core import executors
 from hjepa_cli.core import workers as workers_module
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.camera import Camera
@@ -29,8 +31,8 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.core.policy import teacher
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import BLOCK_DEVICES, Block, Simulator, Tick, run_points
-from hjepa_cli.core.workers import Workers
-from hjepa_cli.errors import DataError, MissingInputError, NumericalError, UsageError
+from hjepa_cli.core.workers import open_workers, single_thread
+from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import evaluate
@@ -196,7 +198,7 @@ def test_an_interrupted_run_continues_after_the_last_method(
         return entry(bench, method)
 
     monkeypatch.setattr(Bench, "entry", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Interrupted, match="interrupted"):
         evaluate.run(settings, Output().screen, checkpoint=str(checkpoint), out=out, remeasure=True)
     measured.clear()
     result = evaluate.run(
@@ -457,13 +459,14 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
     settings = small(steps=8)
     model = Model.load(checkpoint, "cpu")
     ticks: list[int] = []
-    with Workers(settings, checkpoint, 2) as workers:
+    with open_workers(settings, checkpoint, 2) as workers:
         for name in ("oracle", "hjepa"):
             points = [Point("gap", 3.0)]
             theirs = run_points(workers, name, points, 4, ticks.append)
-            ours = run_points(Simulator(settings, model), name, points, 4, lambda steps: None)
+            alone = single_thread(Simulator(settings, model))
+            ours = run_points(alone, name, points, 4, lambda steps: None)
             assert np.array_equal(theirs.score, ours.score)
-            assert theirs.cost == pytest.approx(ours.cost, rel=1e-6)
+            assert np.array_equal(theirs.cost, ours.cost)
         with pytest.raises(UsageError, match="ts-jepa-5"):
             run_points(workers, "ts-jepa-5", points, 4, ticks.append)
         assert run_points(workers, "oracle", points, 4, ticks.append).cost == pytest.approx(
@@ -473,7 +476,7 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
 
 def test_a_dead_worker_is_reported_and_none_is_left_behind() -> None:
     points = [Point("gap", 3.0)]
-    with Workers(small(steps=8, bracket_devices=64), None, 2) as workers:
+    with open_workers(small(steps=8, bracket_devices=64), None, 2) as workers:
         run_points(workers, "oracle", points, 64, lambda steps: None)
         processes = multiprocessing.active_children()
         assert len(processes) == 2
@@ -486,11 +489,12 @@ def test_a_dead_worker_is_reported_and_none_is_left_behind() -> None:
 
 def test_an_interrupt_ends_the_workers_at_once() -> None:
     started = time.monotonic()
+    block = Block("oracle", (Point("gap", 3.0),), 0, 1)
     with (
         pytest.raises(KeyboardInterrupt),
-        Workers(small(steps=1_000_000), None, 1) as workers,
+        executors.worker_pool(1, executors.prepare_worker) as pool,
     ):
-        workers._pool.submit(workers_module._simulate, Block("oracle", (Point("gap", 3.0),), 0, 1))
+        pool.submit(workers_module.simulate, small(steps=1_000_000), None, block)
         raise KeyboardInterrupt
     assert not multiprocessing.active_children()
     assert time.monotonic() - started < 30
@@ -499,7 +503,7 @@ def test_an_interrupt_ends_the_workers_at_once() -> None:
 def test_workers_do_not_run_the_user_s_script_again() -> None:
     """A script without a guard, or one from standard input, may call us too."""
     before = dict(sys.modules["__main__"].__dict__)
-    with workers_module._anonymous_main():
+    with executors.anonymous_main():
         sent = multiprocessing.spawn.get_preparation_data("worker")
     assert not [key for key in sent if key.startswith("init_main")]
     assert sys.modules["__main__"].__dict__ == before
@@ -509,15 +513,15 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(
         "import dataclasses, multiprocessing, os, signal\n"
-        "from hjepa_cli.core import workers\n"
+        "from hjepa_cli.core import executors, workers\n"
         "from hjepa_cli.core.protocol import Point\n"
         "from hjepa_cli.core.simulator import Block\n"
         "from hjepa_cli.settings import load_settings\n"
         "if __name__ == '__main__':\n"
         "    settings = load_settings(flags={'protocol.bracket_devices': 64})\n"
-        "    pool = workers.Workers(settings, None, 1)\n"
+        "    opened = executors.worker_pool(1, executors.prepare_worker)\n"
         "    block = Block('hold-true', (Point('gap', 3.0),), 0, 64)\n"
-        "    pool._pool.submit(workers._simulate, block)\n"
+        "    opened.__enter__().submit(workers.simulate, settings, None, block)\n"
         "    print(multiprocessing.active_children()[0].pid, flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
@@ -541,18 +545,13 @@ def test_eval_uses_workers_where_they_are_worth_it(
 ) -> None:
     asked: list[tuple[Path | None, int]] = []
 
-    class Fake(Simulator):
-        def __init__(self, settings: Settings, model_path: Path | None, count: int) -> None:
-            asked.append((model_path, count))
-            super().__init__(settings, None)
+    @contextlib.contextmanager
+    def fake(settings: Settings, model_path: Path | None, count: int) -> Iterator[Simulator]:
+        asked.append((model_path, count))
+        yield Simulator(settings, None)
+        asked.append((None, 0))
 
-        def __enter__(self) -> "Fake":
-            return self
-
-        def __exit__(self, *error: object) -> None:
-            asked.append((None, 0))
-
-    monkeypatch.setattr(evaluate, "Workers", Fake)
+    monkeypatch.setattr(evaluate, "open_workers", fake)
     for available, worth, expected in (
         (2, 24 * 4, [(checkpoint, 2), (None, 0)]),
         (64, 24 * 4, [(checkpoint, 8), (None, 0)]),

@@ -133,14 +133,16 @@ def test_an_unfinished_run_is_taken_up_again() -> None:
     with Run.create("eval", Path("out"), SETTINGS) as run:
         for epoch in range(5):
             run.metric({"epoch": epoch, "loss": 0.5})
+            if epoch == 2:
+                saved = run.metrics
         uninterrupted = Path("out/metrics.csv").read_bytes()
     with Run.create("eval", Path("out"), SETTINGS) as run:
         assert run.resumed and run.result is None
-        run.keep_metrics(3)
+        run.metrics = saved
         for epoch in range(3, 5):
             run.metric({"epoch": epoch, "loss": 0.5})
         assert Path("out/metrics.csv").read_bytes() == uninterrupted
-        run.keep_metrics(0)
+        run.metrics = ""
         run.metric({"other": 1})
     assert Path("out/metrics.csv").read_text() == "other\n1\n"
     assert '"resumed"' in Path("out/events.jsonl").read_text()

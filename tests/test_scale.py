@@ -37,7 +37,10 @@ def stage(tmp_path, monkeypatch):
             raise MissingInputError("no model 'missing'")
         skipped = {name: "train it" for name in settings.methods if name not in ENTRIES}
         return SimpleNamespace(
-            settings=settings, asked=(checkpoint, dataset), skipped=lambda methods: skipped
+            settings=settings,
+            asked=(checkpoint, dataset),
+            skipped=lambda methods: skipped,
+            inputs=lambda **flags: flags,
         )
 
     def curves_for(subject, screen, record, **arguments):

@@ -76,6 +76,11 @@ class Jepa:
         """Move the target encoder after an optimiser step."""
         self.target.update(self.encoder)
 
+    def parts(self) -> dict[str, nn.Module]:
+        """Everything that training changes, the target included, by name."""
+        parts = {"encoder": self.encoder, "companion": self.predictor, "target": self.target.module}
+        return parts if self.inverse is None else parts | {"inverse": self.inverse}
+
     def parameters(self) -> Iterator[nn.Parameter]:
         """Everything the optimiser trains (the target is not among it)."""
         for module in (self.encoder, self.predictor, self.inverse):

@@ -21,6 +21,14 @@ from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
 
 ENCODE_BATCH = 64  # larger ones fall out of the caches
+CHOICES = {  # of an architecture; its other values are sizes
+    "kind": ("encoder", "hierarchy"),
+    "frame_input": ("difference", "pair"),
+    "stride_actions": ("all", "held"),
+    "centre": (True, False),
+    "residual": (True, False),
+}
+PRECISIONS = ("auto", "bf16", "fp32")
 
 
 def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
@@ -51,19 +59,52 @@ def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
 def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
     """Rebuild the networks of a checkpoint, with strict names, shapes and dtypes.
 
+    Nothing is allocated before the tensors in the file are known to be those of the architecture.
+
     Raises:
-        DataError: its tensors do not fit its architecture.
+        DataError: there is no such architecture, or the tensors do not fit it.
     """
-    modules = build_modules(checkpoint.metadata["architecture"])
+    architecture = check_metadata(checkpoint)["architecture"]
+    try:
+        with torch.device("meta"):
+            planned = build_modules(architecture).state_dict()
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError, UsageError) as error:
+        reason = str(error).partition("\n")[0]
+        raise DataError(
+            f"checkpoint {checkpoint.path} has no valid architecture: {reason}"
+        ) from None
     expected = {
-        name: (str(tensor.numpy().dtype), tuple(tensor.shape))
-        for name, tensor in modules.state_dict().items()
+        name: (str(tensor.dtype).removeprefix("torch."), tuple(tensor.shape))
+        for name, tensor in planned.items()
     }
     check_tensors(checkpoint, expected)
+    modules = build_modules(architecture)
     modules.load_state_dict(
         {name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()}
     )
     return modules.eval()
+
+
+def check_metadata(checkpoint: Checkpoint) -> Mapping[str, Any]:
+    """Return the metadata of a checkpoint whose fields that this program relies on are sound.
+
+    Raises:
+        DataError: one is missing or malformed.
+    """
+    metadata = checkpoint.metadata
+    try:
+        good = (
+            isinstance(metadata["plant"], str)
+            and isinstance(metadata["health"], dict)
+            and metadata["settings"]["encoder"]["precision"] in PRECISIONS
+            and all(metadata["architecture"][name] in allowed for name, allowed in CHOICES.items())
+        )
+        plant(metadata["plant"])
+    except (KeyError, TypeError, ValueError, UsageError):
+        good = False
+    if not good:
+        raise DataError(f"checkpoint {checkpoint.path} lacks metadata or has malformed ones")
+    return metadata
 
 
 def tensors_of(modules: nn.ModuleDict) -> dict[str, NDArray[Any]]:
@@ -127,7 +168,8 @@ class Model:
             DataError: not an intact hierarchy checkpoint.
         """
         checkpoint = load_checkpoint(path)
-        if checkpoint.metadata["architecture"]["kind"] != "hierarchy":
+        architecture = checkpoint.metadata.get("architecture")
+        if isinstance(architecture, dict) and architecture.get("kind") == "encoder":
             raise DataError(
                 f"{path} is a checkpoint of train-encoder, not of train-hierarchy",
                 hint=f"hjepa train-hierarchy --encoder {path}",

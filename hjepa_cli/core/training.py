@@ -107,6 +107,29 @@ class Optimiser:
             )
         self.inner.step()
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Its moments and step counts, flat: ``<parameter's number>.<name>``."""
+        return {
+            f"{number}.{name}": value
+            for number, parameter in enumerate(self.parameters)
+            for name, value in self.inner.state[parameter].items()
+        }
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Put back what :meth:`state_dict` returned; no state is that before the first step.
+
+        Raises:
+            ValueError: it belongs to other parameters.
+        """
+        for key, value in state.items():
+            number, _, name = key.partition(".")
+            parameter = self.parameters[int(number)] if int(number) < len(self.parameters) else None
+            if parameter is None or value.shape not in ((), parameter.shape):
+                raise ValueError(f"optimiser state {key} of shape {tuple(value.shape)}")
+            if value.dim():  # in the parameter's memory layout, or the last bits come out otherwise
+                value = torch.empty_like(parameter).copy_(value)
+            self.inner.state[parameter][name] = value
+
 
 def fit_actor(
     z: Tensor, actions: Tensor, settings: ActorSettings, *, seed: int, epochs: int | None = None

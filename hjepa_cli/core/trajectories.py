@@ -25,8 +25,8 @@ def split_sizes(settings: Settings) -> dict[str, tuple[int, int]]:
     }
 
 
-def generate(settings: Settings, split: str) -> Trajectories:
-    """Simulate one split, all its trajectories at once; frames are not rendered.
+def generate(settings: Settings, split: str, rows: range | None = None) -> Trajectories:
+    """Simulate one split or some of it, all trajectories at once; frames are not rendered.
 
     One step without force leads from the drawn state to k = 0, because the camera needs a frame
     before it. The applied force is the teacher's plus exploration, clipped; the label is the
@@ -35,13 +35,16 @@ def generate(settings: Settings, split: str) -> Trajectories:
     Args:
         settings: plant, seed and ``collect``.
         split: one of :data:`SPLITS`.
+        rows: which trajectories; all by default.
 
     Returns:
         N trajectories of T steps. Trajectory i does not depend on how many there are.
     """
     kind = plant(settings.plant)
-    count, steps = split_sizes(settings)[split]
-    draws = [_draw(settings, split, i, steps) for i in range(count)]
+    size, steps = split_sizes(settings)[split]
+    rows = range(size) if rows is None else rows
+    count = len(rows)
+    draws = [_draw(settings, split, i, steps) for i in rows]
     initial, exploration_n = (np.stack(parts) for parts in zip(*draws, strict=True))
 
     force_n = teacher(kind)

@@ -6,6 +6,8 @@ report how fast that goes on this machine.
 """
 
 import dataclasses
+import functools
+import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,11 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
+from hjepa_cli.core.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.core.payload import raw_frame_bits
 from hjepa_cli.core.trajectories import generate, split_sizes
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import Interrupted, StorageError, UsageError
+from hjepa_cli.interrupts import exit_code
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage.datasets import (
@@ -24,11 +28,16 @@ from hjepa_cli.storage.datasets import (
     Trajectories,
     load_dataset,
     open_directory,
-    write_dataset,
+    per_shard,
+    write_manifest,
+    write_shard,
 )
+from hjepa_cli.storage.files import check_free_space, point_to
+from hjepa_cli.storage.shards import Described, Shard, ShardLog, cut
 
 FRAMES_PER_SAMPLE = 2  # κ: current and previous
 TOGETHER = 20  # trajectories rendered at a time; the sample is one such batch
+WORTH_WORKERS = 4_000_000  # simulated steps; below, processes cost more than they bring
 
 
 def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[str, Any]:
@@ -62,22 +71,34 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             screen.say(f"{directory} holds a finished dataset{changed}; it is left as it is")
             return describe(data, time.perf_counter() - started, frames_per_s=None)
 
-        screen.say(f"collecting {settings.plant} trajectories into {directory}")
-        splits = {name: generate(settings, name) for name in split_sizes(settings)}
-        splits, frames_per_s = film(camera, splits, settings.collect.frames == "stored", screen)
-        data = write_dataset(
+        check_free_space(directory, size_bytes(settings))
+        frames_per_s = rate(camera, settings)
+        log = ShardLog(directory, settings.as_dict())
+        try:
+            shards = make_shards(settings, directory.absolute(), log, screen)
+        except KeyboardInterrupt as error:
+            raise Interrupted(
+                "interrupted; finished shards are kept",
+                hint=continue_command(directory),
+                code=exit_code(error),
+            ) from None
+        except StorageError as error:
+            point_to(continue_command(directory), error)
+            raise
+        data = write_manifest(
             directory,
             settings=definition,
-            splits=splits,
+            shards=shards,
             plant_name=settings.plant,
             camera_manifest=camera.manifest(),
         )
+        log.remove()
     result = describe(data, time.perf_counter() - started, frames_per_s)
     bits = raw_frame_bits(FRAMES_PER_SAMPLE, HEIGHT_PX, WIDTH_PX)
     screen.say(
-        f"{len(splits['train'])} training trajectories in {result['seconds']:.1f} s; as raw frames "
-        f"the training phase takes {result['training_uplink_bits'] / 1e9:.3g} Gbit of uplink "
-        f"({bits} bits a step)"
+        f"{result['trajectories']} training trajectories in {result['seconds']:.1f} s; as raw "
+        f"frames the training phase takes {result['training_uplink_bits'] / 1e9:.3g} Gbit of "
+        f"uplink ({bits} bits a step)"
     )
     return result
 
@@ -106,26 +127,70 @@ def check(settings: Settings) -> None:
             raise UsageError(f"{name} = {value}; expected at least {least}")
 
 
-def film(
-    camera: Camera, splits: dict[str, Trajectories], store: bool, screen: Screen
-) -> tuple[dict[str, Trajectories], float]:
-    """Render every split to be kept, else a sample to be dropped; also returns frames/s."""
-    filmed = splits if store else {"train": splits["train"][:TOGETHER]}
-    total = sum(split.states[..., 0].size for split in filmed.values())
-    kept = {}
+def make_shards(
+    settings: Settings, directory: Path, log: ShardLog, screen: Screen
+) -> list[Described]:
+    """Simulate, and render if frames are stored, every shard that is not there yet."""
+    stored = settings.collect.frames == "stored"
+    sizes = {name: count for name, (count, _) in split_sizes(settings).items()}
+    shards = cut(sizes, per_shard(stored))
+    left = [shard for shard in shards if shard.name not in log.done]
+    done = sum(sizes.values()) - sum(shard.stop - shard.start for shard in left)
+    screen.say(
+        f"collecting {settings.plant} trajectories into {directory.name}: "
+        f"{len(left)} of {len(shards)} shards"
+    )
+    make = functools.partial(make_shard, settings, directory)
+    enough = sum(count * steps for count, steps in split_sizes(settings).values()) >= WORTH_WORKERS
+    with (
+        screen.progress("collect", sum(sizes.values()), "trajectories", done=done) as bar,
+        open_executor(min(cores(), MAX_WORKERS, len(left)) if enough else 0) as (executor, workers),
+    ):
+        for described in finished(executor, workers, make, left):
+            log.add(described)
+            bar.advance(described["trajectories"])
+    return [log.done[shard.name] for shard in shards]
+
+
+def make_shard(settings: Settings, directory: Path, shard: Shard) -> Described:
+    """One unit of parallel work: decided by its arguments, written atomically, so repeatable."""
+    made = generate(settings, shard.split, range(shard.start, shard.stop))
+    if settings.collect.frames == "stored":
+        made = dataclasses.replace(made, frames=film(Camera(settings.plant), made))
+    return write_shard(directory, shard, made)
+
+
+def film(camera: Camera, made: Trajectories) -> np.ndarray:
+    """Frames [N, T + 1, H, W, 3] of some trajectories."""
+    frames = np.empty((*made.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+    for start in range(0, len(made), TOGETHER):
+        states = made.states[start : start + TOGETHER]
+        images = camera.render(states.reshape(-1, 4))
+        frames[start : start + TOGETHER] = images.reshape(-1, *frames.shape[1:])
+    return frames
+
+
+def rate(camera: Camera, settings: Settings) -> float:
+    """Frames per second of a sample that is rendered and dropped."""
+    count = min(TOGETHER, settings.collect.trajectories)
+    sample = generate(settings, "train", range(count))
     started = time.perf_counter()
-    with screen.progress("render" if store else "render a sample", total, "frames") as bar:
-        for name, split in filmed.items():
-            shape = (*split.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
-            frames = np.empty(shape, np.uint8) if store else None
-            for start in range(0, len(split), TOGETHER):
-                states = split.states[start : start + TOGETHER]
-                images = camera.render(states.reshape(-1, 4))
-                if frames is not None:
-                    frames[start : start + TOGETHER] = images.reshape(-1, *shape[1:])
-                bar.advance(len(images))
-            kept[name] = dataclasses.replace(split, frames=frames)
-    return (kept if store else splits), total / (time.perf_counter() - started)
+    film(camera, sample)
+    return sample.states[..., 0].size / (time.perf_counter() - started)
+
+
+def size_bytes(settings: Settings) -> int:
+    """What the dataset takes on disk, without headers."""
+    frame_bytes = HEIGHT_PX * WIDTH_PX * 3 if settings.collect.frames == "stored" else 0
+    return sum(
+        count * ((steps + 1) * (16 + frame_bytes) + 8 * steps)
+        for count, steps in split_sizes(settings).values()
+    )
+
+
+def continue_command(directory: Path) -> str:
+    """What takes an interrupted collection up again."""
+    return f"hjepa resume {shlex.quote(str(directory))}"
 
 
 def describe(data: Dataset, seconds: float, frames_per_s: float | None) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 
 from hjepa_cli.checks import TRUE_STATE, check_methods
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
+from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
 from hjepa_cli.core.loop import Floats
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import WINDOWS
@@ -21,7 +22,7 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.trajectories import generate
-from hjepa_cli.core.workers import MAX_WORKERS, Workers, cores
+from hjepa_cli.core.workers import cluster_runner, open_workers, single_thread
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
@@ -76,6 +77,15 @@ class Subject:
             self.dataset.settings if self.dataset else None,
         )
 
+    def inputs(self, **flags: bool) -> dict[str, Any]:
+        """What a run of this subject was given, for :meth:`Run.create`."""
+        given: dict[str, Any] = dict(flags)
+        if self.model and self.path:
+            given["checkpoint"] = runs.describe_input(self.path, self.model.digest)
+        if self.dataset:
+            given["dataset"] = runs.describe_input(self.dataset.path, self.dataset.digest)
+        return given
+
     @property
     def beside(self) -> list[Path]:
         """Where the model's own curves are; the zoo's are never written, a run's are."""
@@ -118,7 +128,8 @@ def run(
     """
     check_methods(settings.methods)
     subject = open_subject(settings, screen, checkpoint, dataset)
-    with Run.create("eval", out, settings.as_dict()) as record:
+    inputs = subject.inputs(remeasure=remeasure)
+    with Run.create("eval", out, settings.as_dict(), inputs) as record:
         result = record.result
         if result is None:
             result = record.finish(curves_for(subject, screen, record, remeasure=remeasure))
@@ -305,11 +316,19 @@ def _measure(
 def _runner(subject: Subject) -> Iterator[Runner]:
     """Simulate in one process per core, or in this one where that is enough."""
     settings, count = subject.settings, min(cores(), MAX_WORKERS)
-    if count > 1 and _device_steps(settings) >= WORTH_WORKERS:
-        with Workers(settings, subject.path, count) as workers:
+    where = placement()
+    if where.workers is None:
+        several = count > 1 and _device_steps(settings) >= WORTH_WORKERS
+    else:
+        count, several = where.workers, where.workers > 0
+    if where.cluster is not None:
+        with open_cluster(where.cluster, count or cores()) as (executor, _):
+            yield cluster_runner(executor, settings, subject.path)
+    elif several:
+        with open_workers(settings, subject.path, count) as workers:
             yield workers
     else:
-        yield Simulator(settings, subject.model)
+        yield single_thread(Simulator(settings, subject.model))
 
 
 def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:

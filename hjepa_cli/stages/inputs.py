@@ -2,9 +2,10 @@
 
 import dataclasses
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from hjepa_cli.core.training import resolve_device
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
+from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.datasets import (
     Dataset,
     Trajectories,
@@ -144,19 +146,19 @@ def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> Rende
 
 
 @contextmanager
-def training_run(stage: str, out: Path | None, settings: Settings, screen: Screen) -> Iterator[Run]:
+def training_run(
+    stage: str, out: Path | None, settings: Settings, inputs: Mapping[str, Any], screen: Screen
+) -> Iterator[tuple[Run, Progress]]:
     """The run directory of a training stage, its ``result`` set if it is a finished one.
 
-    An interrupted run starts again: the seed decides everything, so it ends as it would have.
+    An interrupted run is taken up where its state was saved.
     """
     keep_freed_memory()
-    with Run.create(stage, out, settings.as_dict()) as record:
+    with Run.create(stage, out, settings.as_dict(), inputs) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
-        elif record.resumed:
-            screen.say(f"{record.directory} was interrupted; it starts again from the same seed")
-            record.keep_metrics(0)
-        yield record
+        with Progress(record, screen) as progress:
+            yield record, progress
 
 
 def versions() -> dict[str, str]:

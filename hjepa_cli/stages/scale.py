@@ -67,7 +67,8 @@ def run(
             f"no model for {', '.join(skipped)}", hint=next(iter(skipped.values()))
         )
     level = settings.protocol.acceptable_score
-    with Run.create("scale", out, settings.as_dict()) as record:
+    inputs = subject.inputs(remeasure=remeasure, verify=verify)
+    with Run.create("scale", out, settings.as_dict(), inputs) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
             show(record.result, screen)

@@ -6,7 +6,6 @@ decide whether the result is worth handing on.
 """
 
 import math
-import time
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +33,9 @@ from hjepa_cli.stages.inputs import (
     training_run,
     versions,
 )
+from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
-from hjepa_cli.storage.runs import Run
+from hjepa_cli.storage.runs import Run, describe_input
 
 STREAM = 2  # this stage's branch of the seed tree
 REJECTED_FILE = "rejected.safetensors"  # what did not pass the gates: nothing trained is lost
@@ -57,11 +57,11 @@ def run(
     data = open_dataset(dataset, settings)
     recorded = {split: data.split(split) for split in ("train", "test")}
     check_stride(settings.encoder.h, recorded["train"].steps)
-    with training_run("train-encoder", out, settings, screen) as record:
+    inputs = {"dataset": describe_input(data.path, data.digest)}
+    with training_run("train-encoder", out, settings, inputs, screen) as (record, progress):
         if record.result is not None:
             show_gates(screen, record.result["gates"])
             return record.result
-        started = time.perf_counter()
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path} ({settings.plant}), run {record.directory}")
         train, test = (render(split, settings.plant, screen) for split in recorded.values())
@@ -69,7 +69,7 @@ def run(
         modules = build_modules(architecture)
         encoder, companion = modules["encoder"], modules["high"]
         assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
-        train_jepa(encoder, companion, train, test, settings, record, screen)
+        train_jepa(encoder, companion, train, test, settings, record, progress, screen)
 
         screen.say("measuring health on all frames and fitting the probe actor")
         report = examine(encoder, companion, train, test, settings, every=1, epochs=None)
@@ -93,11 +93,12 @@ def run(
             refuse(gates, path)
         result = {
             "checkpoint": str(path),
-            "seconds": round(time.perf_counter() - started, 2),
+            "seconds": round(progress.seconds, 2),
             "health": report,
             "gates": gates,
         }
         result = record.finish(result)
+        progress.remove()
         screen.say(f"encoder {path} in {result['seconds']:.0f} s; next: hjepa train-hierarchy")
         return result
 
@@ -126,6 +127,7 @@ def train_jepa(
     test: RenderedSplit,
     settings: Settings,
     record: Run,
+    progress: Progress,
     screen: Screen,
 ) -> None:
     """The training loop; modules are trained in place and left in evaluation mode."""
@@ -160,8 +162,10 @@ def train_jepa(
     stream = generator(settings.seed, STREAM)
     frames_per_epoch = train.actions.numel()
     epoch_steps = max(frames_per_epoch // (options.batch_trajectories * windows.window_frames), 1)
-    with screen.progress("train-encoder", options.steps, "steps") as bar:
-        for step in range(options.steps):
+    parts = jepa.parts() | {"optimiser": optimiser}
+    done = progress.reached("jepa")
+    with screen.progress("train-encoder", options.steps, "steps", done=done) as bar:
+        for step in progress.steps("jepa", options.steps, parts, stream):
             encoder.train()
             batch = windows.draw(options.batch_trajectories, stream)
             with autocast(device, options.precision):

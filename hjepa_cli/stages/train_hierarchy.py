@@ -5,7 +5,6 @@ frozen: every frame is encoded once, and all that follows are small networks on 
 """
 
 import copy
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -36,9 +35,10 @@ from hjepa_cli.stages.inputs import (
     training_run,
     versions,
 )
+from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
 from hjepa_cli.storage.datasets import Dataset
-from hjepa_cli.storage.runs import Run, newest_run, read_config
+from hjepa_cli.storage.runs import Run, describe_input, newest_run, read_config
 from hjepa_cli.storage.zoo import find_model, resolve_model
 
 STREAM = 3  # this stage's branch of the seed tree
@@ -69,11 +69,14 @@ def run(
     check_stride(strides.h, recorded["train"].steps)
     source = open_encoder(encoder, settings, screen)
     trained = load_modules(source)
-    with training_run("train-hierarchy", out, settings, screen) as record:
+    inputs = {
+        "dataset": describe_input(data.path, data.digest),
+        "encoder": describe_input(source.path, source.digest),
+    }
+    with training_run("train-hierarchy", out, settings, inputs, screen) as (record, progress):
         if record.result is not None:
             show(record.result, screen)
             return record.result
-        started = time.perf_counter()
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path}, encoder {source.path}, run {record.directory}")
         architecture = describe_architecture(source, settings)
@@ -86,15 +89,17 @@ def run(
 
         train, test = (render(split, settings.plant, screen) for split in recorded.values())
         seen = embed_all(modules["encoder"], train, settings, screen)
-        screen.say("fitting the semantic actor")
-        actor = fit_actor(
-            torch.cat([data.z.flatten(0, 1) for data, _ in seen]),
-            torch.cat([labels.flatten() for _, labels in seen]),
-            settings.actor,
-            seed=settings.seed,
-        )
-        modules["actor"].load_state_dict(actor.state_dict())
-        train_levels(modules, [data for data, _ in seen], strides, settings, record, screen)
+        if progress.fresh:  # otherwise it comes back with the levels
+            screen.say("fitting the semantic actor")
+            actor = fit_actor(
+                torch.cat([data.z.flatten(0, 1) for data, _ in seen]),
+                torch.cat([labels.flatten() for _, labels in seen]),
+                settings.actor,
+                seed=settings.seed,
+            )
+            modules["actor"].load_state_dict(actor.state_dict())
+        embedded = [data for data, _ in seen]
+        train_levels(modules, embedded, strides, settings, record, progress, screen)
 
         metadata = {
             "stage": "train-hierarchy",
@@ -114,12 +119,13 @@ def run(
         result = {
             "checkpoint": str(path),
             "strides": {"h": strides.h, "m": strides.m, "l": strides.l},
-            "seconds": round(time.perf_counter() - started, 2),
+            "seconds": round(progress.seconds, 2),
             "health": metadata["health"],
             "nmae_windows": nmae_windows(model, data, settings),
             "n_rollouts": len(data.split("clean")),
         }
         result = record.finish(result)
+        progress.remove()
         show(result, screen)
         screen.say(f"model {path} in {result['seconds']:.0f} s; next: hjepa eval")
         return result
@@ -231,6 +237,7 @@ def train_levels(
     strides: Strides,
     settings: Settings,
     record: Run,
+    progress: Progress,
     screen: Screen,
 ) -> None:
     """Train P^H, P^M, P^L and the flat baseline, in that order: each level builds on the last."""
@@ -258,8 +265,10 @@ def train_levels(
             gradient_clip=options.gradient_clip,
         )
         modules[name].train()
-        with screen.progress(f"train {name}", steps, "steps") as bar:
-            for step in range(steps):
+        parts = {"modules": modules, "optimiser": optimiser}
+        done = progress.reached(name)
+        with screen.progress(f"train {name}", steps, "steps", done=done) as bar:
+            for step in progress.steps(name, steps, parts, stream):
                 with autocast(device, settings.encoder.precision):
                     value = loss(stream)
                 optimiser.step(value, step)

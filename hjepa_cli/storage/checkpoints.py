@@ -80,6 +80,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             f"checkpoint {path} does not exist", hint="hjepa models list"
         ) from None
     tensors, text = arrays.unpack(data, path)
+    del data  # never more than twice the file in memory
     sealed = _metadata(text, path)
     check_schema(sealed.get("schema"), SCHEMA, f"checkpoint {path}")
     digest = arrays.content_digest({**sealed, "sha256": ""}, tensors)

@@ -8,7 +8,7 @@ where all three agree; otherwise it counts as not there.
 import contextlib
 import dataclasses
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,9 @@ SCHEMA = 1
 
 Entry = dict[str, Any]
 
-_NUMBERS = ("score", "lq_ratio")
-_TOLERANCES = ("tolerance_gap_steps", "tolerance_p", "bits_per_transmission")
-_LISTS = ("nmae", "nmae_ci95", "score_ci95", "gap_curve", "delivery_curve")
+Check = Callable[[Any], bool]
+
+LARGEST = 1e12  # beyond anything that is measured; keeps arithmetic in range
 _CLEAN = (
     "clean_trajectories",
     "clean_steps",
@@ -88,8 +88,9 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
     if not path.exists():
         return {}
     document = files.read_json(path)
-    if document.get("schema") != SCHEMA or not isinstance(document.get("methods"), dict):
-        raise _damaged(path, f"schema {document.get('schema')!r}, expected {SCHEMA}")
+    files.check_schema(document.get("schema"), SCHEMA, str(path))
+    if not isinstance(document.get("methods"), dict):
+        raise _damaged(path, "no methods")
     if document.get("digest") != dataclasses.asdict(digest):
         return {}
     for name, entry in document["methods"].items():
@@ -155,17 +156,75 @@ def _flaw(entry: object) -> str | None:
     """What keeps an entry from being used, if anything."""
     if not isinstance(entry, dict):
         return "not an object"
-    for keys, kinds in (
-        (_NUMBERS, (int, float)),
-        (_TOLERANCES, (int, float, type(None))),
-        (_LISTS, (list,)),
-    ):
-        for key in keys:
-            if key not in entry:
-                return f"'{key}' is missing"
-            if not isinstance(entry[key], kinds) or isinstance(entry[key], bool):
-                return f"'{key}' is {entry[key]!r}"
+    for key, check in _CHECKS.items():
+        if key not in entry:
+            return f"'{key}' is missing"
+        if not check(entry[key]):
+            return f"'{key}' is {str(entry[key])[:40]!r}"
     return None
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and abs(value) <= LARGEST  # type: ignore[arg-type]
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 0 < value <= LARGEST
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool)
+
+
+def _is_tolerance(value: object) -> bool:
+    return value is None or (_is_number(value) and value >= 0)  # type: ignore[operator]
+
+
+def _is_numbers(value: object) -> bool:
+    return isinstance(value, list) and all(map(_is_number, value))
+
+
+def _is_interval(value: object) -> bool:
+    return _is_numbers(value) and len(value) == 2  # type: ignore[arg-type]
+
+
+def _is_curve(value: object) -> bool:
+    """Points with a gap ``d`` or a probability ``p``, and a score."""
+    return isinstance(value, list) and all(
+        isinstance(point, dict)
+        and _is_number(point.get("score"))
+        and _is_number(point.get("d", point.get("p")))
+        for point in value
+    )
+
+
+def _or_none(check: Check) -> Check:
+    return lambda value: value is None or check(value)
+
+
+_CHECKS: dict[str, Check] = {
+    "score": _is_number,
+    "score_ci95": _is_interval,
+    "lq_ratio": _is_number,
+    "nmae": _is_numbers,
+    "nmae_ci95": lambda value: isinstance(value, list) and all(map(_is_interval, value)),
+    "nmae_windows": lambda value: (
+        isinstance(value, dict) and all(_or_none(_is_number)(entry) for entry in value.values())
+    ),
+    "gap_curve": _is_curve,
+    "delivery_curve": _is_curve,
+    "tolerance_gap_steps": _is_tolerance,
+    "tolerance_gap_ci95": _or_none(_is_interval),
+    "tolerance_gap_censored": _or_none(_is_flag),
+    "tolerance_gap_lq_steps": _is_tolerance,
+    "tolerance_p": _is_tolerance,
+    "tolerance_p_ci95": _or_none(_is_interval),
+    "tolerance_p_censored": _or_none(_is_flag),
+    "bits_per_transmission": lambda value: value is None or _is_count(value),
+    "n_devices": _is_count,
+    "n_curve_devices": _is_count,
+    "n_rollouts": _is_count,
+}
 
 
 def _damaged(path: Path, reason: str) -> DataError:

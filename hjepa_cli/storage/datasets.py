@@ -7,8 +7,7 @@ dataset only when it is complete. No time, host or path is stored: equal inputs,
 import contextlib
 import dataclasses
 import hashlib
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ import numpy as np
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError
 from hjepa_cli.storage import files
 from hjepa_cli.storage import tensors as arrays
+from hjepa_cli.storage.shards import LOG, Described, Shard, cut
+from hjepa_cli.storage.shards import NAME as SHARD_NAME
 
 SCHEMA = 1
 FORMAT = "hjepa-dataset"
@@ -25,8 +26,6 @@ SPLITS = ("train", "test", "clean")
 FRAME_SHAPE = (64, 128, 3)  # height, width, RGB
 SHARD_TRAJECTORIES = 1000
 SHARD_TRAJECTORIES_WITH_FRAMES = 50  # about 120 MB
-
-_SHARD = re.compile(r"shard-\d{5}\.safetensors")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,24 +130,65 @@ def write_dataset(
         raise UsageError(f"{directory} holds a dataset already", hint="choose another --out DIR")
     _remove_shards(directory)
     stored = any(split.frames is not None for split in splits.values())
-    described = {}
-    number = 0
     for name, split in splits.items():
         _check(split.tensors(), len(split), split.steps, stored, directory / name)
-        shards = []
-        for rows in _shard_rows(len(split), stored):
-            shard = f"shard-{number:05d}.safetensors"
-            data = arrays.pack(split[rows].tensors())
-            files.write_bytes(directory / shard, data)
-            shards.append(
-                {
-                    "name": shard,
-                    "trajectories": len(split[rows]),
-                    "sha256": hashlib.sha256(data).hexdigest(),
-                }
-            )
-            number += 1
-        described[name] = {"trajectories": len(split), "steps": split.steps, "shards": shards}
+    done = [
+        write_shard(directory, shard, splits[shard.split][shard.start : shard.stop])
+        for shard in cut({name: len(split) for name, split in splits.items()}, per_shard(stored))
+    ]
+    return write_manifest(
+        directory,
+        settings=settings,
+        shards=done,
+        plant_name=plant_name,
+        camera_manifest=camera_manifest,
+    )
+
+
+def write_shard(directory: Path, shard: Shard, trajectories: Trajectories) -> Described:
+    """Write one shard and return how the manifest will describe it.
+
+    Raises:
+        DataError: wrong shapes or dtypes, or values that are not finite.
+        StorageError: the disk refused.
+    """
+    stored = trajectories.frames is not None
+    path = directory / shard.name
+    _check(trajectories.tensors(), len(trajectories), trajectories.steps, stored, path)
+    data = arrays.pack(trajectories.tensors())
+    files.write_bytes(path, data)
+    return {
+        "name": shard.name,
+        "split": shard.split,
+        "trajectories": len(trajectories),
+        "steps": trajectories.steps,
+        "stored": stored,
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+
+
+def write_manifest(
+    directory: Path,
+    *,
+    settings: Mapping[str, Any],
+    shards: Sequence[Described],
+    plant_name: str,
+    camera_manifest: Mapping[str, Any],
+) -> Dataset:
+    """Write ``dataset.json``, which makes the written shards a dataset.
+
+    Args:
+        directory: where the shards are.
+        settings, plant_name, camera_manifest: as for :func:`write_dataset`.
+        shards: what :func:`write_shard` returned, in the order of their numbers.
+    """
+    stored = any(shard["stored"] for shard in shards)
+    described: dict[str, Any] = {}
+    for shard in shards:
+        empty = {"trajectories": 0, "steps": shard["steps"], "shards": []}
+        split = described.setdefault(shard["split"], empty)
+        split["trajectories"] += shard["trajectories"]
+        split["shards"].append({key: shard[key] for key in ("name", "trajectories", "sha256")})
     manifest = {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -238,9 +278,9 @@ def find_newest_dataset(root: Path, plant_name: str) -> Path | None:
     return root / max(found)[1] if found else None
 
 
-def _shard_rows(count: int, stored: bool) -> list[slice]:
-    size = SHARD_TRAJECTORIES_WITH_FRAMES if stored else SHARD_TRAJECTORIES
-    return [slice(start, start + size) for start in range(0, count, size)]
+def per_shard(stored: bool) -> int:
+    """Trajectories of a shard, with stored frames or without."""
+    return SHARD_TRAJECTORIES_WITH_FRAMES if stored else SHARD_TRAJECTORIES
 
 
 def _check(
@@ -280,7 +320,7 @@ def _check_manifest(manifest: Mapping[str, Any], path: Path) -> None:
             and all(
                 type(split["steps"]) is int
                 and len(split["shards"]) > 0
-                and all(_SHARD.fullmatch(shard["name"]) for shard in split["shards"])
+                and all(SHARD_NAME.fullmatch(shard["name"]) for shard in split["shards"])
                 and all(type(shard["trajectories"]) is int for shard in split["shards"])
                 and all(isinstance(shard["sha256"], str) for shard in split["shards"])
                 for split in manifest["splits"].values()
@@ -298,7 +338,8 @@ def _refuse_foreign(directory: Path) -> None:
         load_dataset(directory)  # a foreign or damaged dataset.json says so itself
         return
     for name in entries:
-        if name != files.LOCK_FILE and not _SHARD.fullmatch(name) and not files.is_temporary(name):
+        ours = name in (files.LOCK_FILE, LOG) or SHARD_NAME.fullmatch(name)
+        if not ours and not files.is_temporary(name):
             raise UsageError(
                 f"{directory} is not empty and not an hjepa dataset: it holds '{name}'",
                 hint="choose a new or empty directory with --out DIR",
@@ -308,7 +349,7 @@ def _refuse_foreign(directory: Path) -> None:
 def _remove_shards(directory: Path) -> None:
     """Delete the shards of a collection that was interrupted before its manifest."""
     for name in files.list_names(directory):
-        if _SHARD.fullmatch(name):
+        if SHARD_NAME.fullmatch(name):
             try:
                 (directory / name).unlink()
             except OSError as error:

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -23,6 +24,7 @@ JSON_LIMIT_BYTES = 16 * 2**20
 
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp")  # .<name>.<pid>.tmp
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FREE_SPACE = "free some disk space, then "
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -218,10 +220,26 @@ def is_temporary(name: str) -> bool:
 def storage_error(path: Path, error: OSError) -> StorageError:
     """Turn an OSError on ``path`` into one line with the next step."""
     if error.errno in _NO_SPACE:
-        hint = "free some disk space, then run the same command again"
+        hint = _FREE_SPACE + "run the same command again"
     else:
         hint = "choose a directory that you may write to with --out DIR"
     return StorageError(f"cannot write {path}: {error.strerror or error}", hint=hint)
+
+
+def check_free_space(directory: Path, size_bytes: int) -> None:
+    """Refuse to begin what the disk cannot hold. Raises StorageError."""
+    free_bytes = shutil.disk_usage(directory).free
+    if free_bytes < size_bytes:
+        raise StorageError(
+            f"{directory} has {free_bytes / 1e9:.1f} GB free; {size_bytes / 1e9:.1f} GB are needed",
+            hint="free some disk space, or choose another disk with --out DIR",
+        )
+
+
+def point_to(command: str, error: BaseException | None) -> None:
+    """Let the hint of a full disk name the command that goes on."""
+    if isinstance(error, StorageError) and (error.hint or "").startswith(_FREE_SPACE):
+        error.hint = _FREE_SPACE + command
 
 
 def _writing(pid: int) -> bool:

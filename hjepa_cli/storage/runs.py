@@ -1,7 +1,7 @@
 """Run directories: what a stage was asked, what happened, and the result, written last.
 
 ``runs/<stage>/<nnnn>/`` holds ``config.toml`` (fully resolved, usable with ``--config``),
-``environment.json`` (stage, versions, command), ``metrics.csv`` (no time, host or path),
+``environment.json`` (stage, versions, command, inputs), ``metrics.csv`` (no time, host or path),
 ``events.jsonl`` (timings), the checkpoints of the stage, and ``result.json`` once it is finished.
 """
 
@@ -11,6 +11,7 @@ import io
 import json
 import os
 import platform
+import shlex
 import sys
 import time
 import tomllib
@@ -20,7 +21,8 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from hjepa_cli import __version__
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
+from hjepa_cli.interrupts import exit_code
 from hjepa_cli.storage import files
 
 ROOT = Path("runs")
@@ -29,6 +31,8 @@ ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
 EVENTS = "events.jsonl"
 RESULT = "result.json"
+
+SCHEMA = 2  # of environment.json; 1 had neither a schema nor inputs
 
 _PACKAGES = ("torch", "numpy", "scipy", "pymunk", "safetensors", "typer", "rich")
 
@@ -50,7 +54,13 @@ class Run:
 
     @classmethod
     def create(
-        cls, stage: str, out: Path | None, settings: Mapping[str, Any], *, root: Path = ROOT
+        cls,
+        stage: str,
+        out: Path | None,
+        settings: Mapping[str, Any],
+        inputs: Mapping[str, Any] | None = None,
+        *,
+        root: Path = ROOT,
     ) -> Self:
         """Open ``out``, or a new ``runs/<stage>/<nnnn>``, for this process alone.
 
@@ -58,10 +68,12 @@ class Run:
             stage: the command's name.
             out: a new or empty directory, an interrupted run to take up, or a finished one.
             settings: resolved settings (:meth:`hjepa_cli.settings.Settings.as_dict`).
+            inputs: what else the stage was given, for ``hjepa resume``: files by
+                :func:`describe_input`, flags as they are.
             root: the parent of the automatic directories.
 
         Raises:
-            UsageError: ``out`` holds something else, or a run with other settings.
+            UsageError: ``out`` holds something else, or a run with other settings or input files.
             LockedError: another process works in it.
             StorageError: not writable.
         """
@@ -73,7 +85,7 @@ class Run:
             _refuse_foreign(directory, stage)
         run = cls(directory, files.lock_directory(directory))
         try:
-            run._open(stage, settings)
+            run._open(stage, settings, inputs or {})
         except BaseException:
             run.close()
             raise
@@ -97,10 +109,19 @@ class Run:
             raise ValueError(f"metrics.csv has columns {columns}, not {list(row)}")
         self._append(METRICS, _csv_line([_cell(value) for value in row.values()]))
 
-    def keep_metrics(self, rows: int) -> None:
-        """Forget all but the first ``rows`` rows: those after the checkpoint taken up again."""
-        lines = _whole_lines(self.path(METRICS))
-        files.write_text(self.path(METRICS), "".join(lines[: rows + 1 if rows else 0]))
+    @property
+    def metrics(self) -> str:
+        """The text of ``metrics.csv``; assigned, it puts the file back to an earlier state."""
+        return "".join(_whole_lines(self.path(METRICS)))
+
+    @metrics.setter
+    def metrics(self, text: str) -> None:
+        files.write_text(self.path(METRICS), text)
+
+    @property
+    def continue_command(self) -> str:
+        """What takes this run up again."""
+        return f"hjepa resume {shlex.quote(str(self.directory))}"
 
     def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
         """Write ``result.json``, which makes the run a finished one, and return what it holds."""
@@ -122,18 +143,27 @@ class Run:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+        files.point_to(self.continue_command, error)
+        if isinstance(error, KeyboardInterrupt):
+            raise Interrupted(
+                "interrupted; what is finished is kept",
+                hint=self.continue_command,
+                code=exit_code(error),
+            ) from None
 
-    def _open(self, stage: str, settings: Mapping[str, Any]) -> None:
+    def _open(self, stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
         if self.path(CONFIG).exists():
             self.resumed = True
             finished = self.path(RESULT).exists()
             differences = _differences(read_config(self.directory), settings)
+            recorded = read_environment(self.directory)["inputs"]
+            differences += _differences(_digests(recorded), _digests(inputs))
             if differences:
                 raise UsageError(
                     f"{self.directory} holds {'a finished' if finished else 'an unfinished'} run "
                     f"with other settings: {'; '.join(differences)}",
-                    hint=f"repeat its own settings to {'see' if finished else 'continue'} it, "
-                    "or choose another --out DIR",
+                    hint=f"{self.continue_command} {'shows' if finished else 'continues'} it as it "
+                    "is; or choose another --out DIR",
                 )
             if finished:
                 self.result = files.read_json(self.path(RESULT))
@@ -143,7 +173,7 @@ class Run:
                     files.write_text(self.path(name), "".join(_whole_lines(self.path(name))))
             self.event("resumed")
             return
-        files.write_json(self.path(ENVIRONMENT), environment(stage, settings))
+        files.write_json(self.path(ENVIRONMENT), environment(stage, settings, inputs))
         files.write_text(self.path(CONFIG), to_toml(settings))
         self.event("started")
 
@@ -189,8 +219,32 @@ def read_config(directory: Path) -> dict[str, Any]:
     path = directory / CONFIG
     try:
         return tomllib.loads(files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid TOML: {error}") from None
+
+
+def read_environment(directory: Path) -> dict[str, Any]:
+    """Return what :func:`environment` recorded of a run; ``inputs`` is empty for older runs.
+
+    Raises:
+        MissingInputError: not a run directory.
+        DataError: damaged, or of a newer schema.
+    """
+    path = directory / ENVIRONMENT
+    if not path.exists():
+        raise MissingInputError(f"{directory} is not a run directory: no {ENVIRONMENT}")
+    recorded = {"schema": 1, **files.read_json(path)}
+    if recorded["schema"] == 1:
+        recorded |= {"schema": SCHEMA, "inputs": {}}
+    files.check_schema(recorded["schema"], SCHEMA, f"run {directory}")
+    if not isinstance(recorded.get("stage"), str) or not isinstance(recorded.get("inputs"), dict):
+        raise DataError(f"{path} lacks fields or has malformed ones")
+    return recorded
+
+
+def describe_input(path: Path, digest: str) -> dict[str, str]:
+    """How a run remembers a file or directory that it reads: where it was and what it was."""
+    return {"path": str(path.absolute()), "sha256": digest}
 
 
 def to_toml(settings: Mapping[str, Any]) -> str:
@@ -210,8 +264,10 @@ def to_toml(settings: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def environment(stage: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a run depended on besides its settings: versions, machine, command."""
+def environment(
+    stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what a run depended on besides its settings: inputs, versions, machine, command."""
     versions = {"hjepa": __version__, "python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -219,7 +275,9 @@ def environment(stage: str, settings: Mapping[str, Any]) -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             versions[package] = "not installed"
     return {
+        "schema": SCHEMA,
         "stage": stage,
+        "inputs": inputs,
         "preset": settings.get("preset"),
         "command": sys.argv,
         "versions": versions,
@@ -232,7 +290,7 @@ def environment(stage: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 def _refuse_foreign(directory: Path, stage: str) -> None:
     entries = files.list_names(directory)
     if CONFIG in entries:
-        other = files.read_json(directory / ENVIRONMENT).get("stage")
+        other = read_environment(directory)["stage"]
         if other != stage:
             raise UsageError(
                 f"{directory} holds a run of '{other}', not of '{stage}'",
@@ -255,6 +313,13 @@ def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         for key in sorted(before.keys() | after.keys())
         if key != "preset" and before.get(key) != after.get(key)
     ]
+
+
+def _digests(inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of the input files; where they are may change."""
+    return {
+        name: value.get("sha256") for name, value in inputs.items() if isinstance(value, Mapping)
+    }
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,0 +1,357 @@
+"""Files that lie: mutated checkpoints, datasets, curves, run records and TOML.
+
+    python benchmarks/fuzz.py --cases 100000 --seed 0
+
+Each case damages a valid small file: bytes are flipped, cut, inserted or moved, or values of its
+JSON are replaced, removed or added and its sha256 is made to fit again, so that what lies behind
+the digest is reached. Whatever comes out must be a result or an error for people
+(``HjepaError``), soon, without taking more than twice the file's size in memory. Prints cases
+per second and outcomes by kind; the first violation ends it with the seed that repeats it.
+"""
+
+import argparse
+import collections
+import copy
+import io
+import json
+import random
+import struct
+import sys
+import tempfile
+import time
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hjepa_cli import models
+from hjepa_cli.checks import check_settings
+from hjepa_cli.core.cell import Cell, Need
+from hjepa_cli.core.model import Model, build_modules, tensors_of
+from hjepa_cli.errors import HjepaError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import load_settings
+from hjepa_cli.storage import curves, datasets, files, runs, shards, tensors
+from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
+
+SLOWEST_S = 5.0
+OVERHEAD_BYTES = 4_000_000  # of the reader itself: parsed JSON, messages
+QUIET = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+NASTY = [
+    None, True, False, 0, 1, -1, 2, 3.5, 1e308, -1e308, 10**30, 2**63, "", "x", "../../x",
+    "\x1b[31m", "[/red]", "desktop", "hierarchy", "NaN", [], [1], [[]], {}, {"a": 1}, "0" * 64,
+]  # fmt: skip
+ARCHITECTURE = {
+    "kind": "hierarchy", "embedding": 8, "hidden": 8, "frame_input": "difference", "centre": True,
+    "stride_actions": "all", "residual": True, "h": 4, "m": 2, "l": 1, "actor_hidden": 8,
+    "actor_dropout": 0.1,
+}  # fmt: skip
+METADATA = {
+    "stage": "train-hierarchy",
+    "plant": "desktop",
+    "architecture": ARCHITECTURE,
+    "settings": {"encoder": {"precision": "fp32"}},
+    "health": {"std": 1.0},
+    "seed": 0,
+    "versions": {"torch": "2"},
+}
+DIGEST = curves.Digest("0" * 64, "1" * 64)
+
+
+def mutate_bytes(data: bytes, chance: random.Random) -> bytes:
+    """Damage anywhere, with a preference for the beginning, where headers are."""
+    damaged = bytearray(data)
+    for _ in range(chance.choice((1, 1, 2, 5))):
+        end = len(damaged) if chance.random() < 0.5 else min(len(damaged), 600)
+        at = chance.randrange(max(end, 1))
+        kind = chance.randrange(5)
+        if kind == 0 and damaged:
+            damaged[min(at, len(damaged) - 1)] ^= 1 << chance.randrange(8)
+        elif kind == 1:
+            del damaged[at:]
+        elif kind == 2:
+            damaged[at:at] = chance.choice((b"\0", b'"', b"{", b"[" * 2000, b"9" * 5000, b"\xff"))
+        elif kind == 3:
+            del damaged[at : at + chance.randrange(1, 50)]
+        else:
+            damaged[at : at + 8] = struct.pack("<Q", chance.choice((0, 2**20, 2**40, 2**64 - 1)))
+    return bytes(damaged)
+
+
+def mutate_json(value: Any, chance: random.Random) -> Any:
+    """Replace, remove or add a value somewhere."""
+    changed = copy.deepcopy(value)
+    for _ in range(chance.choice((1, 1, 2))):
+        node = changed
+        while True:
+            keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+            if not keys:
+                break
+            key = chance.choice(keys)
+            if isinstance(node[key], dict | list) and node[key] and chance.random() < 0.75:
+                node = node[key]
+                continue
+            kind = chance.randrange(4)
+            if kind == 0:
+                del node[key]
+            elif kind == 1 and isinstance(node, dict):
+                node["extra"] = chance.choice(NASTY)
+            else:
+                node[key] = copy.deepcopy(chance.choice(NASTY))
+            break
+    return changed
+
+
+class Target:
+    """A kind of file: how to damage one, and how the program reads it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / type(self).__name__.lower()
+
+    def damage(self, chance: random.Random) -> int:
+        """Write a damaged file; return its size in bytes."""
+        raise NotImplementedError
+
+    def read(self) -> None:
+        """Use it as the program does."""
+        raise NotImplementedError
+
+    def _write(self, path: Path, data: bytes) -> int:
+        path.write_bytes(data)
+        return len(data)
+
+
+class Checkpoint(Target):
+    """Few, small tensors; metadata resealed."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.arrays = {"a": np.ones((30, 40), np.float32), "b": np.arange(3)}
+        save_checkpoint(self.path, self.arrays, METADATA)
+        self.good = self.path.read_bytes()
+
+    def damage(self, chance: random.Random) -> int:
+        if chance.random() < 0.6:
+            return self._write(self.path, mutate_bytes(self.good, chance))
+        return self._write(self.path, seal(self.arrays, mutate_json(METADATA, chance), chance))
+
+    def read(self) -> None:
+        load_checkpoint(self.path)
+        models.show_info(QUIET, str(self.path))
+
+
+class Networks(Target):
+    """A whole model: its architecture is changed behind a good digest."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.arrays = tensors_of(build_modules(ARCHITECTURE))
+
+    def damage(self, chance: random.Random) -> int:
+        arrays = dict(self.arrays)
+        name = chance.choice(sorted(arrays))
+        if chance.random() < 0.2:
+            del arrays[name]
+        elif chance.random() < 0.2:
+            arrays[name] = arrays[name][..., None]
+        metadata = dict(METADATA)
+        if chance.random() < 0.5:
+            metadata["architecture"] = mutate_json(ARCHITECTURE, chance)
+        else:
+            metadata = mutate_json(metadata, chance)
+        return self._write(self.path, seal(arrays, metadata, chance))
+
+    def read(self) -> None:
+        Model.load(self.path, "cpu")
+
+
+class Dataset(Target):
+    """The manifest, resealed, or a shard."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.path.mkdir()
+        part = datasets.Trajectories(
+            np.ones((3, 6, 4), np.float32), np.ones((3, 5), np.float32), np.ones((3, 5), np.float32)
+        )
+        datasets.write_dataset(
+            self.path,
+            settings={"seed": 0},
+            splits={"train": part, "clean": part},
+            plant_name="desktop",
+            camera_manifest={},
+        )
+        self.manifest = json.loads((self.path / datasets.MANIFEST).read_text())
+        self.shard = self.path / "shard-00000.safetensors"
+        self.good = self.shard.read_bytes()
+
+    def damage(self, chance: random.Random) -> int:
+        manifest, shard = copy.deepcopy(self.manifest), self.good
+        if chance.random() < 0.4:  # a shard that the manifest describes truthfully
+            shard = mutate_bytes(shard, chance)
+            digest = datasets.hashlib.sha256(shard).hexdigest()
+            manifest["splits"]["train"]["shards"][0]["sha256"] = digest
+        else:
+            manifest = mutate_json(manifest, chance)
+        if isinstance(manifest, dict) and "sha256" in manifest:
+            manifest["sha256"] = ""
+            manifest["sha256"] = tensors.content_digest(manifest, {})
+        text = json.dumps(manifest).encode()
+        if chance.random() < 0.2:
+            text = mutate_bytes(text, chance)
+        self._write(self.shard, shard)
+        return len(shard) + self._write(self.path / datasets.MANIFEST, text)
+
+    def read(self) -> None:
+        found = datasets.load_dataset(self.path)
+        for name in found.splits:
+            found.split(name)
+
+
+class Curves(Target):
+    """``curves.json`` up to the device counts made of it."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        point = {"d": 1.0, "score": 0.9, "ci95": [0.8, 1.0], "lq_ratio": 0.9, "n_devices": 4}
+        entry = {
+            "score": 0.9, "score_ci95": [0.8, 1.0], "lq_ratio": 0.9, "nmae": [0.1], "n_devices": 4,
+            "nmae_ci95": [[0.0, 0.2]], "nmae_windows": {"1-20": 0.1}, "n_curve_devices": 4,
+            "n_rollouts": 2, "gap_curve": [point], "delivery_curve": [point],
+            "tolerance_gap_steps": 12.5, "tolerance_gap_ci95": [11.0, 14.0],
+            "tolerance_gap_censored": False, "tolerance_gap_lq_steps": 7.0, "tolerance_p": 0.1,
+            "tolerance_p_ci95": [0.05, 0.2], "tolerance_p_censored": False,
+            "bits_per_transmission": 2064,
+        }  # fmt: skip
+        curves.write(self.path, DIGEST, {"hjepa": entry})
+        self.good = json.loads(self.path.read_text())
+
+    def damage(self, chance: random.Random) -> int:
+        text = json.dumps(mutate_json(self.good, chance)).encode()
+        if chance.random() < 0.2:
+            text = mutate_bytes(text, chance)
+        return self._write(self.path, text)
+
+    def read(self) -> None:
+        for method, entry in curves.read(self.path, DIGEST).items():
+            for law in ("duty", "equal"):
+                cell = Cell(law, "fixed", 20e6, 0.001, 10.0)
+                cell.row(Need.under(law, method, entry), 20.0)
+
+
+class Records(Target):
+    """What a run and a collection remember: ``environment.json``, ``collecting.jsonl``."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.path.mkdir()
+        self.good = runs.environment("eval", {"preset": "default"}, {"remeasure": True})
+
+    def damage(self, chance: random.Random) -> int:
+        text = json.dumps(mutate_json(self.good, chance)).encode()
+        if chance.random() < 0.3:
+            text = mutate_bytes(text, chance)
+        log = b'{"seed":1}\n{"name":"shard-00000.safetensors","sha256":"0"}\n'
+        self._write(self.path / shards.LOG, mutate_bytes(log, chance))
+        return self._write(self.path / runs.ENVIRONMENT, text)
+
+    def read(self) -> None:
+        try:
+            shards.ShardLog(self.path, {"seed": 1})
+        except HjepaError:
+            pass
+        runs.read_environment(self.path)
+
+
+class Toml(Target):
+    """``--config FILE.toml``."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.good = load_settings().as_dict()
+
+    def damage(self, chance: random.Random) -> int:
+        settings = mutate_json(self.good, chance)
+        try:
+            text = runs.to_toml(settings).encode()
+        except (TypeError, ValueError):
+            text = runs.to_toml(self.good).encode()
+        if chance.random() < 0.5:
+            text = mutate_bytes(text, chance)
+        return self._write(self.path, text)
+
+    def read(self) -> None:
+        check_settings(load_settings(config=self.path))
+
+
+TARGETS: tuple[type[Target], ...] = (Checkpoint, Dataset, Curves, Records, Toml, Networks)
+SHARES = (30, 25, 15, 15, 14, 1)  # in percent; a model takes as long as a hundred others
+
+
+def seal(arrays: dict[str, Any], metadata: Any, chance: random.Random) -> bytes:
+    """A checkpoint whose digest is right, whatever its metadata says."""
+    sealed = {**metadata, "schema": chance.choice((1, 1, 1, 1, 1, 2, "1")), "sha256": ""}
+    digest = tensors.content_digest(sealed, arrays)
+    return tensors.pack(arrays, files.canonical_json({**sealed, "sha256": digest}))
+
+
+def check(target: Target, chance: random.Random, *, measure: bool = False) -> str:
+    """Damage and read one file; return the kind of outcome.
+
+    Args:
+        measure: watch memory, which makes it some times slower.
+
+    Raises:
+        AssertionError: too slow, or too much memory.
+        Exception: anything but an error for people.
+    """
+    size = target.damage(chance)
+    if measure:
+        tracemalloc.start()
+    started = time.process_time()  # other programs do not count
+    try:
+        target.read()
+        outcome = "accepted"
+    except HjepaError as error:
+        assert "\n" not in error.message.strip()[:2000], error.message
+        outcome = type(error).__name__
+    finally:
+        peak = tracemalloc.get_traced_memory()[1] if measure else 0
+        tracemalloc.stop()
+    assert time.process_time() - started < SLOWEST_S, "too slow"
+    assert peak <= 2 * size + OVERHEAD_BYTES, f"{peak} bytes for a file of {size}"
+    return outcome
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--measure-every", type=int, default=10, help="watch memory in every Nth")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    outcomes: collections.Counter[tuple[str, str]] = collections.Counter()
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        targets = [kind(Path(folder)) for kind in TARGETS]
+        for case in range(options.cases):
+            chance = random.Random(options.seed * 10**9 + case)
+            (target,) = chance.choices(targets, SHARES)
+            try:
+                outcome = check(target, chance, measure=case % options.measure_every == 0)
+            except Exception:
+                print(
+                    f"case {case} of seed {options.seed}: {type(target).__name__}", file=sys.stderr
+                )
+                raise
+            outcomes[type(target).__name__, outcome] += 1
+    seconds = time.perf_counter() - started
+    print(f"{options.cases} cases in {seconds:.0f} s ({options.cases / seconds:.0f} a second)")
+    for (name, outcome), count in sorted(outcomes.items()):
+        print(f"{count:8}  {name:12}{outcome}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""Ctrl-C and SIGTERM: stop at the next safe point, then say how to go on.
+
+Without anybody in the way they raise: :class:`KeyboardInterrupt` and its kind :class:`Terminated`.
+A loop that must not be cut postpones the first one and asks for it between its steps; a second one
+stops at once.
+"""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+from hjepa_cli.errors import Interrupted
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as a batch system sends it before it kills."""
+
+
+@contextmanager
+def sigterm_raises() -> Iterator[None]:
+    """Let SIGTERM unwind the program like Ctrl-C; by default it would end without a word."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # handlers can be set in the main thread alone
+        return
+    before = signal.signal(signal.SIGTERM, _raise)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def exit_code(error: BaseException) -> int:
+    """What the shell sees of an interruption: 128 + the signal's number."""
+    return 128 + (signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT)
+
+
+class Postponed:
+    """Handlers of both signals while it is entered; see :meth:`postpone`."""
+
+    def __init__(self) -> None:
+        self._inside = False
+        self._signal: int | None = None
+        self._before: dict[int, Any] = {}
+
+    @contextmanager
+    def postpone(self) -> Iterator[Callable[[], bool]]:
+        """Keep the first signal back; what is yielded tells whether it came."""
+        self._inside = True
+        try:
+            yield lambda: self._signal is not None
+        finally:
+            self._inside = False
+        if self._signal is not None:  # it came after the last look
+            _raise(self._signal, None)
+
+    def interrupted(self, message: str, hint: str) -> Interrupted:
+        """The error to raise for the signal that was kept back."""
+        return Interrupted(message, hint=hint, code=128 + (self._signal or signal.SIGINT))
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # only there it is allowed
+            self._before = {number: signal.signal(number, self._handle) for number in SIGNALS}
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._inside and self._signal is None:
+            self._signal = number
+        else:
+            _raise(number, frame)
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt

@@ -1,0 +1,243 @@
+"""Wherever parallel work runs, the bytes are the same; what dies is done again or reported."""
+
+import dataclasses
+import hashlib
+import io
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import Shell, assert_one_line_error, open_shell
+
+from hjepa_cli.core import executors
+from hjepa_cli.core.executors import InProcess, finished, open_executor, placed
+from hjepa_cli.errors import Interrupted, NumericalError, UsageError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import load_settings
+from hjepa_cli.stages import collect, resume, scale
+from hjepa_cli.storage import datasets
+from hjepa_cli.storage.shards import LOG, Shard, ShardLog, cut
+
+SCREEN = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+SETTINGS = load_settings(
+    flags={
+        "collect.trajectories": 9,
+        "collect.test_trajectories": 3,
+        "collect.clean_trajectories": 2,
+        "collect.steps": 12,
+        "collect.clean_steps": 12,
+        "collect.frames": "stored",
+        "protocol.steps": 40,
+        "protocol.curve_devices": 4,
+        "protocol.bracket_devices": 40,
+        "protocol.gaps": [1, 4, 16],
+        "protocol.horizon": 8,
+        "protocol.bootstrap": 20,
+        "radio.snr_db": "0:49:1",
+        "methods": ["hjepa", "hold-true", "zero-true", "oracle"],
+    }
+)
+
+
+@pytest.fixture(autouse=True)
+def small_shards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(datasets, "SHARD_TRAJECTORIES_WITH_FRAMES", 2)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A Dask cluster of two worker processes, started apart from the command."""
+    distributed = pytest.importorskip("distributed")
+    with (
+        executors.anonymous_main(),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        ) as started,
+    ):
+        yield started
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in directory.iterdir()}
+
+
+def kill_a_worker(cluster: Any, when: Path) -> threading.Thread:
+    """SIGKILL one of its processes as soon as ``when`` exists."""
+    pids = [worker.pid for worker in cluster.workers.values()]
+
+    def kill() -> None:
+        while not when.exists():
+            time.sleep(0.001)
+        os.kill(pids[0], signal.SIGKILL)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    return thread
+
+
+def test_a_dataset_is_the_same_from_any_number_of_workers_and_from_a_cluster(cluster: Any) -> None:
+    for name, place in {
+        "zero": placed(0),
+        "two": placed(2),
+        "killed": placed(cluster=cluster.scheduler_address),
+    }.items():
+        killer = kill_a_worker(cluster, Path(name, LOG)) if name == "killed" else None
+        with place:
+            collect.run(SETTINGS, SCREEN, out=Path(name))
+        if killer:
+            killer.join()
+        assert len(list(Path(name).glob("shard-*"))) == 5 + 2 + 1
+        assert contents(Path(name)) == contents(Path("zero"))
+
+
+def test_a_sweep_is_the_same_from_any_number_of_workers_and_from_a_cluster(cluster: Any) -> None:
+    """50 signal-to-noise ratios by 4 methods: 200 cells, one CSV."""
+    found = set()
+    for name, place in {
+        "zero": placed(0),
+        "two": placed(2),
+        "killed": placed(cluster=cluster.scheduler_address),
+    }.items():
+        out = Path(name)
+        killer = kill_a_worker(cluster, out / "curves.json") if name == "killed" else None
+        with place:
+            result = scale.run(
+                SETTINGS, SCREEN, checkpoint="desktop-h4m2l1", out=out, remeasure=True
+            )
+        if killer:
+            killer.join()
+        assert len(result["rows"]) == 200
+        found.add((out / "devices.csv").read_bytes())
+    assert len(found) == 1
+
+
+def test_units_come_back_few_at_a_time() -> None:
+    asked: list[int] = []
+
+    def square(number: int) -> int:
+        asked.append(number)
+        return number**2
+
+    results = finished(InProcess(), 1, square, range(10**9))  # never held in memory
+    assert [next(results) for _ in range(3)] == [0, 1, 4] and asked == [0, 1, 2]
+    assert sorted(finished(InProcess(), 1, square, range(7))) == [n**2 for n in range(7)]
+    assert list(finished(InProcess(), 1, square, [])) == []
+
+
+def test_errors_of_a_unit_come_through() -> None:
+    def fail(_: int) -> int:
+        raise UsageError("no")
+
+    with pytest.raises(UsageError, match="no"):
+        list(finished(InProcess(), 1, fail, [1]))
+
+
+def test_a_dead_worker_is_one_line() -> None:
+    with (
+        pytest.raises(NumericalError, match="a worker process died"),
+        placed(1),
+        open_executor(0) as (executor, workers),
+    ):
+        list(finished(executor, workers, os._exit, [9]))
+
+
+def test_an_interrupted_collection_keeps_its_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    collect.run(SETTINGS, SCREEN, out=Path("whole"))
+    write, made = collect.write_shard, []
+
+    def interrupt(directory: Path, shard: Shard, *rest: Any) -> Any:
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(shard.name)
+        return write(directory, shard, *rest)
+
+    monkeypatch.setattr(collect, "write_shard", interrupt)
+    with pytest.raises(Interrupted) as caught:
+        collect.run(SETTINGS, SCREEN, out=Path("part"))
+    assert caught.value.hint == "hjepa resume part"
+    other = dataclasses.replace(SETTINGS, seed=5)
+    with pytest.raises(UsageError, match="unfinished dataset with other settings"):
+        collect.run(other, SCREEN, out=Path("part"))
+    with open(f"part/{LOG}", "ab") as log:
+        log.write(b'{"name": "shard-00')  # a kill in the middle of a line
+    flipped = bytearray(Path("part/shard-00001.safetensors").read_bytes())
+    flipped[-1] ^= 1
+    Path("part/shard-00001.safetensors").write_bytes(flipped)
+    Path("part/shard-00005.safetensors").write_bytes(b"there, but not ours")
+    made.clear()
+    made.extend(["x", "x", "x", "x"])
+    resume.run(Path("part"), SCREEN)
+    assert made[4:] == [f"shard-{number:05d}.safetensors" for number in (1, 3, 4, 5, 6, 7)]
+    assert contents(Path("part")) == contents(Path("whole"))
+    assert resume.run(Path("part"), SCREEN)["trajectories"] == 9
+
+
+def test_a_log_that_lies_is_not_believed(tmp_path: Path) -> None:
+    outside = tmp_path / "shard-00000.safetensors"
+    outside.write_bytes(b"x")
+    directory = tmp_path / "d"
+    directory.mkdir()
+    ShardLog(directory, {"seed": 1})
+    digest = hashlib.sha256(b"x").hexdigest()
+    with open(directory / LOG, "a") as log:
+        log.write(f'{{"name": "../shard-00000.safetensors", "sha256": "{digest}"}}\n')
+        log.write('{"name": 3, "sha256": "x"}\n{"sha256": "x"}\n[]\n\xff\n')
+    assert ShardLog(directory, {"seed": 1}).done == {}
+
+
+def test_shards_cut_every_split() -> None:
+    shards = cut({"a": 5, "b": 2}, 2)
+    assert [(s.number, s.split, s.start, s.stop) for s in shards] == [
+        (0, "a", 0, 2), (1, "a", 2, 4), (2, "a", 4, 5), (3, "b", 0, 2),
+    ]  # fmt: skip
+
+
+def test_no_room_is_said_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = type("Usage", (), {"free": 1_000_000})
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
+    with pytest.raises(Exception, match=r"0\.0 GB free; 0\.0 GB are needed") as caught:
+        collect.run(SETTINGS, SCREEN, out=Path("full"))
+    assert caught.value.exit_code == 74  # type: ignore[attr-defined]
+    assert contents(Path("full")).keys() == {".lock"}
+
+
+def test_the_size_that_is_promised_is_the_size_on_disk() -> None:
+    collect.run(SETTINGS, SCREEN, out=Path("data"))
+    shards = sum(path.stat().st_size for path in Path("data").glob("shard-*"))
+    assert shards == pytest.approx(collect.size_bytes(SETTINGS), rel=0.01)
+
+
+@pytest.fixture
+def hjepa(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Shell:
+    return open_shell(tmp_path, monkeypatch, capsys)
+
+
+def test_places_that_are_not_there(hjepa: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_one_line_error(hjepa("collect", "--workers", "-1"), 2, "--workers")
+    monkeypatch.setattr(executors, "CONNECT_S", 1)
+    assert_one_line_error(hjepa("collect", "--quiet", "--cluster", "nonsense:1"), 2, "nonsense:1")
+    monkeypatch.setattr(executors.importlib.util, "find_spec", lambda _: None)
+    missing = hjepa("collect", "--quiet", "--cluster", "local")
+    assert_one_line_error(missing, 2, "needs Dask", 'pip install "hjepa[cluster]"')
+
+
+def test_a_million_trajectories_are_planned(hjepa: Shell) -> None:
+    plan = hjepa("collect", "--trajectories", "1000000", "--dry-run", "--json").document["plan"]
+    assert "in 1002 shards" in plan["writes"][0]
+    assert plan["writes_bytes"] == pytest.approx(1e6 * (101 * 16 + 800), rel=0.01)
+    assert 1 < plan["minutes"] < 60
+    assert hjepa.files() == {}
+
+
+def test_places_are_forgotten_afterwards() -> None:
+    with placed(3, None):
+        assert executors.placement().workers == 3
+    assert executors.placement().workers is None

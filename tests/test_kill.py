@@ -1,0 +1,55 @@
+"""Real processes, killed at random moments of each stage: old or new files, and the same end.
+
+``benchmarks/kill.py`` does it more often.
+"""
+
+import random
+import sys
+from multiprocessing.context import BaseContext
+from pathlib import Path
+
+import pytest
+from test_benchmarks import REPOSITORY
+
+sys.path.insert(0, str(REPOSITORY / "benchmarks"))  # children import it by name
+import kill
+
+sys.path.pop(0)
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory: pytest.TempPathFactory) -> BaseContext:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(REPOSITORY / "benchmarks")
+        return kill.context()
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("kill")
+
+
+@pytest.mark.parametrize("stage", kill.STAGES)
+def test_killed_and_continued_is_whole(
+    stage: str, root: Path, context: BaseContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(REPOSITORY / "benchmarks")
+    seconds = kill.run_whole(context, stage, root)
+    chance = random.Random(stage)
+    moments = [chance.uniform(0.2, 0.9) for _ in range(3)]
+    kill.kill_stage(context, stage, root, root / f"{stage}-killed", seconds, moments)
+
+
+def test_the_comparison_can_fail(root: Path, tmp_path: Path) -> None:
+    whole, other = tmp_path / "whole", tmp_path / "other"
+    for directory in (whole, other):
+        directory.mkdir()
+        (directory / "result.json").write_text("{}")
+        (directory / "metrics.csv").write_text("a\n1\n")
+    kill.compare(whole, other)
+    (other / "metrics.csv").write_text("a\n1\n1\n")
+    with pytest.raises(AssertionError):
+        kill.compare(whole, other)
+    (other / "metrics.csv").unlink()
+    with pytest.raises(AssertionError):
+        kill.compare(whole, other)

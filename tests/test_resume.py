@@ -1,0 +1,429 @@
+"""Training that is interrupted and continued ends in the bytes of training that is not."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import ENVIRONMENT, Shell, assert_one_line_error, open_shell
+
+from hjepa_cli.core.jepa import Jepa
+from hjepa_cli.core.training import Optimiser
+from hjepa_cli.errors import DataError, Interrupted, NumericalError, StorageError, UsageError
+from hjepa_cli.interrupts import Postponed, Terminated, sigterm_raises
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.stages import collect, progress, resume, train_encoder, train_hierarchy
+from hjepa_cli.stages.progress import PROGRESS_FILE
+from hjepa_cli.storage import runs
+from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
+
+QUIET = Screen(quiet=True)
+TINY = {
+    "collect.trajectories": 4,
+    "collect.test_trajectories": 2,
+    "collect.clean_trajectories": 2,
+    "collect.steps": 20,
+    "collect.clean_steps": 12,
+    "protocol.horizon": 10,
+    "encoder.embedding": 16,
+    "encoder.hidden": 16,
+    "actor.hidden": 16,
+    "encoder.steps": 5,
+    "encoder.batch_trajectories": 8,
+    "encoder.batch_frames": 5,
+    "encoder.gate": False,
+    "actor.epochs": 1,
+    "actor.batch": 40,
+    "hierarchy.rollout_steps": 8,
+    "hierarchy.batch_trajectories": 2,
+    "hierarchy.coarse_steps": 3,
+    "hierarchy.flat_steps": 2,
+    "hierarchy.medium_steps": 2,
+    "hierarchy.low_steps": 2,
+}
+STEPS = {"train-encoder": 5, "train-hierarchy": 9}  # of all loops of the stage
+
+Train = Callable[[Path], dict[str, Any]]
+
+
+def settings(**changes: object) -> Settings:
+    return load_settings(flags=TINY | {key.replace("__", "."): v for key, v in changes.items()})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset, and both stages trained without interruption."""
+    root = tmp_path_factory.mktemp("resume")
+    collect.run(settings(), QUIET, out=root / "data")
+    for stage in STEPS:
+        trainer(stage, root)(root / stage)
+    return root
+
+
+def trainer(stage: str, root: Path) -> Train:
+    if stage == "train-encoder":
+        return lambda out: train_encoder.run(settings(), QUIET, dataset=root / "data", out=out)
+    encoder = str(root / "train-encoder")
+    return lambda out: train_hierarchy.run(
+        settings(), QUIET, dataset=root / "data", encoder=encoder, out=out
+    )
+
+
+def signal_after(monkeypatch: pytest.MonkeyPatch, steps: int, number: int = signal.SIGINT) -> None:
+    """Send this process a signal in the middle of a training step."""
+    update, seen = Optimiser.step, 0
+
+    def step(self: Optimiser, loss: torch.Tensor, index: int) -> None:
+        nonlocal seen
+        seen += 1
+        if seen == steps:
+            os.kill(os.getpid(), number)
+        update(self, loss, index)
+
+    monkeypatch.setattr(Optimiser, "step", step)
+
+
+def crash_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    """Let the step after ``steps`` fail, as a bug or a lack of memory would."""
+    update, seen = Optimiser.step, 0
+
+    def step(self: Optimiser, loss: torch.Tensor, index: int) -> None:
+        nonlocal seen
+        seen += 1
+        if seen > steps:
+            raise RuntimeError("crash")
+        update(self, loss, index)
+
+    monkeypatch.setattr(Optimiser, "step", step)
+
+
+def skip_actor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit no actor with the counted optimiser: only steps of the loops count."""
+    for module in (train_encoder, train_hierarchy):
+        fit = module.fit_actor
+
+        def uncounted(*args: Any, fit: Any = fit, **options: Any) -> Any:
+            counted, Optimiser.step = Optimiser.step, ORIGINAL_STEP  # type: ignore[method-assign]
+            try:
+                return fit(*args, **options)
+            finally:
+                Optimiser.step = counted  # type: ignore[method-assign]
+
+        monkeypatch.setattr(module, "fit_actor", uncounted)
+
+
+ORIGINAL_STEP = Optimiser.step
+
+
+def assert_equal_runs(one: Path, other: Path) -> None:
+    for name in ("model.safetensors", "metrics.csv", "config.toml"):
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    assert not (one / PROGRESS_FILE).exists() and not (other / PROGRESS_FILE).exists()
+
+
+@pytest.mark.parametrize("stage", STEPS)
+def test_interrupted_at_any_step_and_continued_is_uninterrupted(
+    stage: str, workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C in every third step, at each end of a loop included, until the run ends."""
+    train, out, interruptions = trainer(stage, workplace), tmp_path / "run", 0
+    skip_actor(monkeypatch)
+    while not (out / runs.RESULT).exists():
+        with monkeypatch.context() as patched:
+            signal_after(patched, 3 if interruptions % 2 else 2)
+            try:
+                train(out)
+            except Interrupted as interrupted:
+                assert interrupted.exit_code == 130
+                assert interrupted.hint == f"hjepa resume {out}"
+                assert "all is saved" in interrupted.message
+                interruptions += 1
+    assert interruptions == (2 if stage == "train-encoder" else 3)
+    assert_equal_runs(out, workplace / stage)
+
+
+@pytest.mark.parametrize("stage", STEPS)
+def test_a_stop_between_saves_repeats_what_was_lost(
+    stage: str, workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A crash loses steps and leaves rows of metrics behind; both are made again, once."""
+    train, out = trainer(stage, workplace), tmp_path / "run"
+    every_s = iter((1e9, 0.0, 1e9))
+    for steps in (1, 2, 2):
+        with monkeypatch.context() as patched:
+            skip_actor(patched)
+            crash_after(patched, steps)
+            patched.setattr(progress, "SAVE_EVERY_S", next(every_s))
+            with pytest.raises(RuntimeError, match="crash"):
+                train(out)
+    with open(out / runs.METRICS, "a") as rows:
+        rows.write("99,left,behind\n")
+    train(out)
+    assert_equal_runs(out, workplace / stage)
+
+
+def test_each_part_of_the_state_matters(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Leave one part out and the continued run is another one: the comparison can fail."""
+    parts, interrupted = Jepa.parts, tmp_path / "interrupted"
+    with monkeypatch.context() as patched:
+        signal_after(patched, 3)
+        with pytest.raises(Interrupted):
+            trainer("train-encoder", workplace)(interrupted)
+    for forgotten in ("target", "inverse", "optimiser", "stream"):
+        out = Path(shutil.copytree(interrupted, tmp_path / forgotten))
+        with monkeypatch.context() as patched:
+            saved = load_checkpoint(out / PROGRESS_FILE)
+            kept = dict(saved.tensors)
+            if forgotten == "optimiser":
+                kept = {name: value for name, value in kept.items() if "optimiser" not in name}
+                save_checkpoint(out / PROGRESS_FILE, kept, saved.metadata)
+            elif forgotten == "stream":
+                other = np.random.Generator(np.random.Philox(1)).bit_generator.state
+                changed = saved.metadata | {"stream": progress._plain(other)}
+                save_checkpoint(out / PROGRESS_FILE, kept, changed)
+            else:
+                kept = {name: v for name, v in kept.items() if not name.startswith(forgotten)}
+                save_checkpoint(out / PROGRESS_FILE, kept, saved.metadata)
+                patched.setattr(
+                    Jepa,
+                    "parts",
+                    lambda self, name=forgotten: {
+                        key: part for key, part in parts(self).items() if key != name
+                    },
+                )
+            trainer("train-encoder", workplace)(out)
+        model = out / "model.safetensors"
+        assert model.read_bytes() != (workplace / "train-encoder" / model.name).read_bytes()
+
+
+def test_the_optimiser_keeps_its_memory_layout() -> None:
+    """Moments in another layout would take another code path and end in other last bits."""
+    weight = torch.nn.Parameter(torch.randn(4, 3, 5, 5).to(memory_format=torch.channels_last))
+
+    def optimiser() -> Optimiser:
+        return Optimiser(
+            [weight],
+            name="adamw",
+            schedule="constant",
+            steps=9,
+            learning_rate=0.1,
+            weight_decay=0.1,
+            gradient_clip=0.0,
+        )
+
+    first, second = optimiser(), optimiser()
+    first.step((weight**2).sum(), 0)
+    second.load_state_dict({name: value.contiguous() for name, value in first.state_dict().items()})
+    moments = second.inner.state[weight]
+    assert moments["exp_avg"].stride() == weight.stride()
+    for name, value in first.inner.state[weight].items():
+        assert torch.equal(moments[name], value)
+    with pytest.raises(ValueError, match="optimiser state"):
+        second.load_state_dict({"0.exp_avg": torch.zeros(2)})
+    with pytest.raises(ValueError, match="optimiser state"):
+        second.load_state_dict({"7.exp_avg": torch.zeros(4, 3, 5, 5)})
+
+
+def test_saved_state_that_does_not_fit_is_refused(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train, out = trainer("train-encoder", workplace), tmp_path / "run"
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        signal_after(patched, 1)
+        with pytest.raises(Interrupted):
+            train(out)
+    saved = load_checkpoint(out / PROGRESS_FILE)
+    for change in ("missing", "extra", "shape", "field", "bytes"):
+        tensors, metadata = dict(saved.tensors), dict(saved.metadata)
+        name = min(tensors)
+        if change == "missing":
+            del tensors[name]
+        elif change == "extra":
+            tensors["optimiser.9999.exp_avg"] = tensors[name]
+        elif change == "shape":
+            tensors[name] = tensors[name][..., :1]
+        elif change == "field":
+            del metadata["stream"]
+        save_checkpoint(out / PROGRESS_FILE, tensors, metadata)
+        if change == "bytes":
+            (out / PROGRESS_FILE).write_bytes((out / PROGRESS_FILE).read_bytes()[:-1])
+        with pytest.raises(DataError, match="progress") as caught:
+            train(out)
+        assert "\n" not in caught.value.message
+    (out / PROGRESS_FILE).unlink()  # what the hint says
+    train(out)
+    assert_equal_runs(out, workplace / "train-encoder")
+
+
+def test_resume_needs_no_other_flag(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the dataset nor the preset; from any directory."""
+    out = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        signal_after(patched, 4)
+        with pytest.raises(Interrupted):
+            trainer("train-hierarchy", workplace)(out)
+    monkeypatch.chdir(tmp_path)
+    result = resume.run(Path("run"), QUIET)
+    assert_equal_runs(out, workplace / "train-hierarchy")
+    assert resume.run(out, QUIET) == result  # finished: told again
+
+
+def test_another_dataset_is_another_run(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        signal_after(patched, 1)
+        with pytest.raises(Interrupted):
+            trainer("train-encoder", workplace)(out)
+    collect.run(settings(seed=7), QUIET, out=tmp_path / "data")
+    with pytest.raises(UsageError, match=r"dataset = ") as caught:
+        train_encoder.run(settings(), QUIET, dataset=tmp_path / "data", out=out)
+    assert f"hjepa resume {out}" in str(caught.value.hint)
+
+
+def test_a_full_disk_names_the_command_that_goes_on(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(progress, "SAVE_EVERY_S", 0.0)
+        patched.setattr(progress, "save_checkpoint", lambda *_: runs.files.write_bytes(*_[:1], b""))
+        patched.setattr(os, "replace", full)
+        patched.setattr(runs.files, "write_json", lambda *_: None)
+        patched.setattr(runs.files, "write_text", lambda path, text: path.write_text(text))
+        with pytest.raises(StorageError, match="No space left") as caught:
+            trainer("train-encoder", workplace)(out)
+    assert caught.value.hint == f"free some disk space, then hjepa resume {out}"
+
+
+def test_a_diverging_run_saves_nothing_that_is_not_finite(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, total = tmp_path / "run", Jepa.total
+    calls = 0
+
+    def poisoned(self: Jepa, terms: dict[str, torch.Tensor]) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        return total(self, terms) * (float("nan") if calls == 3 else 1.0)
+
+    monkeypatch.setattr(Jepa, "total", poisoned)
+    monkeypatch.setattr(progress, "SAVE_EVERY_S", 0.0)
+    with pytest.raises(NumericalError, match=r"diverged at step 2 .*learning rate") as caught:
+        trainer("train-encoder", workplace)(out)
+    assert caught.value.exit_code == 70
+    assert not (out / "model.safetensors").exists()
+    assert load_checkpoint(out / PROGRESS_FILE).metadata["step"] == 2
+
+
+def test_signals_inside_and_outside_of_loops() -> None:
+    with Postponed() as interrupts:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with interrupts.postpone() as stopped:
+            assert not stopped()
+            signal.raise_signal(signal.SIGTERM)
+            assert stopped()
+            assert interrupts.interrupted("x", "y").exit_code == 143
+            with pytest.raises(KeyboardInterrupt):  # the second one stops at once
+                signal.raise_signal(signal.SIGINT)
+            interrupts._signal = None
+        with pytest.raises(Terminated), interrupts.postpone():
+            signal.raise_signal(signal.SIGTERM)  # after the loop's last look
+    with sigterm_raises(), pytest.raises(Terminated):
+        signal.raise_signal(signal.SIGTERM)
+
+
+@pytest.fixture
+def hjepa(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Shell:
+    return open_shell(tmp_path, monkeypatch, capsys)
+
+
+def test_what_cannot_be_resumed(hjepa: Shell) -> None:
+    assert_one_line_error(hjepa("resume", "gone"), 66, "run gone does not exist")
+    (hjepa.directory / "empty").mkdir()
+    assert_one_line_error(hjepa("resume", "empty"), 66, "not a run directory")
+    run = hjepa.directory / "run"
+    run.mkdir()
+    (run / "config.toml").write_text("")
+    for text, code, message in (
+        ("{", 65, "not valid JSON"),
+        ('{"schema": 3, "stage": "eval", "inputs": {}}', 65, "reads up to 2"),
+        ('{"schema": 2, "stage": "eval", "inputs": []}', 65, "malformed"),
+        ('{"schema": 2, "stage": "eval", "inputs": {}, "preset": 3}', 65, "preset"),
+        ('{"schema": 2, "stage": "dance", "inputs": {}}', 65, "'dance'"),
+        ('{"stage": "eval", "preset": "nonsense"}', 2, "nonsense"),
+    ):
+        (run / "environment.json").write_text(text)
+        assert_one_line_error(hjepa("resume", "run"), code, message)
+
+
+def test_a_batch_system_ends_a_run_the_same_way(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    signal_after(monkeypatch, 1, signal.SIGTERM)
+    with pytest.raises(Interrupted, match="all is saved") as caught:
+        trainer("train-encoder", workplace)(tmp_path / "run")
+    assert caught.value.exit_code == 143
+
+
+def test_a_real_process_saves_and_says_how_to_go_on(workplace: Path, tmp_path: Path) -> None:
+    """Ctrl-C from outside, a second process kept out, and the printed command."""
+    stage = [
+        sys.executable,
+        "-m",
+        "hjepa_cli",
+        "train-encoder",
+        "--dataset",
+        str(workplace / "data"),
+    ]
+    config = tmp_path / "config.toml"
+    config.write_text(runs.to_toml(settings(encoder__steps=100_000).as_dict()))
+    command = [*stage, "--config", str(config), "--out", "run"]
+    environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+    ) as child:
+        rows = tmp_path / "run" / "metrics.csv"
+        while child.poll() is None and not (rows.exists() and rows.stat().st_size):
+            time.sleep(0.05)  # until it trains
+        second = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True)
+        assert second.returncode == 75, second
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=60)
+    assert child.returncode == 130, errors
+    assert "all is saved" in errors and "hint: hjepa resume run\n" in errors
+    saved = load_checkpoint(tmp_path / "run" / PROGRESS_FILE).metadata
+    assert f"after step {saved['step']} of 100000" in errors
+    assert json.loads((tmp_path / "run" / runs.ENVIRONMENT).read_text())["inputs"]["dataset"]

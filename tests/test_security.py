@@ -1,0 +1,108 @@
+"""Nothing that is read is ever executed, and nothing that is printed is ever interpreted."""
+
+import ast
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "hjepa_cli").rglob("*.py"))
+MODULES = {
+    "pickle",
+    "cPickle",
+    "dill",
+    "cloudpickle",
+    "joblib",
+    "shelve",
+    "marshal",
+    "yaml",
+    "code",
+}
+CALLS = {"eval", "exec", "compile", "__import__"}  # as bare names; module.eval() is torch's
+METHODS = {
+    *("torch.load", "torch.save", "torch.hub", "torch.jit.load", "numpy.load", "np.load"),
+    *("importlib.import_module", "runpy.run_path", "runpy.run_module", "os.system", "os.popen"),
+    *("subprocess.run", "subprocess.Popen", "subprocess.call", "subprocess.check_output"),
+    *("urllib.request.urlopen", "np.loadtxt", "np.genfromtxt", "pkgutil.resolve_name"),
+}
+
+
+def violations(source: str) -> list[str]:
+    """What a source does that could execute what it reads."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Attribute):
+            names = [ast.unparse(node)]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            names = [f"{node.func.id}()"]
+        elif isinstance(node, ast.keyword) and node.arg in ("allow_pickle", "shell"):
+            names = [f"{node.arg}="]
+        else:
+            continue
+        found += [
+            f"line {node.lineno}: {name}"
+            for name in names
+            if name.split(".")[0] in MODULES
+            or name in METHODS
+            or (name.removesuffix("()") in CALLS and name.endswith("()"))
+            or name.endswith("=")
+        ]
+    return found
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_read_is_executed(path: Path) -> None:
+    assert violations(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "import yaml as y",
+        "import torch\ntorch.load(path)",
+        "from torch import load",
+        "np.load(path)",
+        "np.save(path, allow_pickle=True)",
+        "eval(text)",
+        "exec(text)",
+        "__import__(name)",
+        "importlib.import_module(name)",
+        "from importlib import import_module",
+        "subprocess.run(line, shell=True)",
+        "os.system(line)",
+    ],
+)
+def test_the_guard_sees_it(source: str) -> None:
+    assert violations(source)
+
+
+def test_the_guard_lets_models_be_evaluated() -> None:
+    assert violations("model.eval()\nre.compile(text)\ntorch.compile(model)") == []
+
+
+def test_dependencies_are_few_and_bounded() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert len(project["dependencies"]) <= 8
+    for requirement in project["dependencies"]:
+        assert ">=" in requirement and "<" in requirement.partition(">=")[2], requirement
+
+
+def test_a_model_of_any_name_prints_as_text(capsys: pytest.CaptureFixture[str]) -> None:
+    """Names come from files: markup, control characters and line ends in them stay visible."""
+    from hjepa_cli.screen import Screen
+
+    screen = Screen()
+    evil = "[/red]\x1b[2J\r\nhint: rm -rf ~\u202e"
+    screen.table("t", ["name"], [[evil]])
+    screen.result(evil)
+    shown = capsys.readouterr().out
+    assert "\x1b" not in shown and "\r" not in shown and "\u202e" not in shown
+    assert "[/red]" in shown
+    assert not any(line.startswith("hint:") for line in shown.splitlines())
