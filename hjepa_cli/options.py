@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hjepa_cli import completion
 from hjepa_cli.checks import METHODS
 from hjepa_cli.settings import PRESETS
 
@@ -42,6 +43,17 @@ def number(minimum: float) -> Callable[[str], float]:
         if not minimum <= value < float("inf"):
             raise typer.BadParameter(f"'{text}' is not a finite number of at least {minimum:g}")
         return value
+
+    return parse
+
+
+def one_of(*choices: str) -> Callable[[str], str]:
+    """Return a parser that takes one of a few words."""
+
+    def parse(text: str) -> str:
+        if text not in choices:
+            raise typer.BadParameter(f"'{text}' is not one of {', '.join(choices)}")
+        return text
 
     return parse
 
@@ -111,6 +123,7 @@ Encoder = Annotated[
         "--encoder",
         "Encoder to build on: a zoo name or a path. Without it: that of the newest run.",
         metavar="NAME|PATH",
+        autocompletion=completion.models,
     ),
 ]
 Checkpoint = Annotated[
@@ -120,15 +133,45 @@ Checkpoint = Annotated[
         "--checkpoint",
         "Model to use: a zoo name or a path. Without it: the newest run's, else the zoo's.",
         metavar="NAME|PATH",
+        autocompletion=completion.models,
     ),
 ]
 
 ModelName = Annotated[
-    str, typer.Argument(help="A zoo name or a path.", metavar="NAME|PATH", show_default=False)
+    str,
+    typer.Argument(
+        help="A zoo name or a path.",
+        metavar="NAME|PATH",
+        show_default=False,
+        autocompletion=completion.models,
+    ),
 ]
 ModelNames = Annotated[
     list[str] | None,
-    typer.Argument(help="Zoo names or paths.", metavar="[NAME|PATH]...", show_default=False),
+    typer.Argument(
+        help="Zoo names or paths.",
+        metavar="[NAME|PATH]...",
+        show_default=False,
+        autocompletion=completion.models,
+    ),
+]
+DatasetPath = Annotated[
+    Path | None,
+    typer.Argument(
+        help="Dataset to look at. Without it: the newest in data/.",
+        metavar="[DIR]",
+        show_default=False,
+        autocompletion=completion.datasets,
+    ),
+]
+DatasetPaths = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Datasets to check. Without one: all in data/.",
+        metavar="[DIR]...",
+        show_default=False,
+        autocompletion=completion.datasets,
+    ),
 ]
 
 # --- data
@@ -148,6 +191,68 @@ Frames = Annotated[
         "Render camera frames when they are read, or store them with the states.",
         "rendered",
         "stored",
+    ),
+]
+
+Split = Annotated[
+    str,
+    typer.Option(
+        "--split",
+        help="Which trajectories.",
+        metavar="train|test|clean",
+        parser=one_of("train", "test", "clean"),
+        rich_help_panel=DATA,
+        autocompletion=lambda: ["train", "test", "clean"],
+    ),
+]
+SheetRows = Annotated[
+    int,
+    typer.Option(
+        "--rows",
+        help="Trajectories shown, one per row.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=DATA,
+    ),
+]
+SheetColumns = Annotated[
+    int,
+    typer.Option(
+        "--columns",
+        help="Frames per trajectory.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=DATA,
+    ),
+]
+ExportFormat = Annotated[
+    str | None,
+    typer.Option(
+        "--format",
+        help="hdf5: the layout of stable-worldmodel (needs h5py); npz: the same columns for numpy. "
+        "Without it: by the suffix of --out.",
+        metavar="hdf5|npz",
+        parser=one_of("hdf5", "npz"),
+        rich_help_panel=DATA,
+        show_default=False,
+        autocompletion=lambda: ["hdf5", "npz"],
+    ),
+]
+Pixels = Annotated[
+    bool,
+    typer.Option(
+        "--pixels/--no-pixels",
+        help="With the camera frames (rendered now unless they are stored), or states only.",
+        rich_help_panel=DATA,
+    ),
+]
+FileOut = Annotated[
+    Path | None,
+    _plain(
+        FILES,
+        "--out",
+        "File to write; one that is there is replaced.",
+        metavar="FILE",
     ),
 ]
 
@@ -278,6 +383,18 @@ PlantName = Annotated[
     _one_of(SETTINGS, "--plant", "Cart-pole to work with.", "desktop", "gym"),
 ]
 Seed = Annotated[int | None, _count(SETTINGS, "--seed", "Seed of everything random.", minimum=0)]
+SettingPrefix = Annotated[
+    str,
+    typer.Argument(
+        help="Only this section or value, as protocol or protocol.steps.",
+        metavar="[KEY]",
+        show_default=False,
+        autocompletion=completion.settings,
+    ),
+]
+Toml = Annotated[
+    bool, _plain(SETTINGS, "--toml", "As TOML that --config accepts, without origins.")
+]
 Device = Annotated[
     str | None,
     _one_of(SETTINGS, "--device", "Where to compute; auto: cuda if there.", "auto", "cpu", "cuda"),
