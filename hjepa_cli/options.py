@@ -32,7 +32,7 @@ def whole_number(minimum: int) -> Callable[[str], int]:
     return parse
 
 
-def number(minimum: float) -> Callable[[str], float]:
+def number(minimum: float, maximum: float = float("inf")) -> Callable[[str], float]:
     """Return a parser of finite numbers of at least ``minimum``; NaN is refused."""
 
     def parse(text: str) -> float:
@@ -40,8 +40,11 @@ def number(minimum: float) -> Callable[[str], float]:
             value = float(text)
         except ValueError:
             value = float("nan")
-        if not minimum <= value < float("inf"):
-            raise typer.BadParameter(f"'{text}' is not a finite number of at least {minimum:g}")
+        if not (minimum <= value <= maximum and value < float("inf")):
+            most = f" and at most {maximum:g}" if maximum < float("inf") else ""
+            raise typer.BadParameter(
+                f"'{text}' is not a finite number of at least {minimum:g}{most}"
+            )
         return value
 
     return parse
@@ -355,6 +358,79 @@ Noise = Annotated[
         "scaled",
     ),
 ]
+
+# --- view
+
+ViewDevices = Annotated[
+    int,
+    typer.Option(
+        "--devices",
+        help="Devices side by side.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=LOOP,
+    ),
+]
+ViewSnr = Annotated[
+    float,
+    typer.Option(
+        "--snr",
+        help="Mean signal-to-noise ratio in dB.",
+        metavar="DB",
+        parser=number(-100.0, 100.0),
+        rich_help_panel=RADIO,
+    ),
+]
+Delivery = Annotated[
+    float,
+    typer.Option(
+        "--delivery",
+        help="Share of packets that arrive over the fading link.",
+        metavar="P",
+        parser=number(1e-6, 1 - 1e-6),
+        rich_help_panel=RADIO,
+    ),
+]
+Gap = Annotated[
+    float | None,
+    _plain(
+        RADIO,
+        "--gap",
+        "Instead of fading: a packet every so many steps.",
+        metavar="STEPS",
+        parser=number(1.0),
+    ),
+]
+Every = Annotated[
+    int | None,
+    _plain(
+        LOOP,
+        "--every",
+        "Control steps between pictures. Without it: a hundred pictures in all.",
+        metavar="STEPS",
+        parser=whole_number(1),
+    ),
+]
+Fps = Annotated[
+    int,
+    typer.Option(
+        "--fps",
+        help="Pictures per second.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=LOOP,
+    ),
+]
+AnimationOut = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        help="File to write, .gif or .mp4; one that is there is replaced.",
+        metavar="FILE",
+        rich_help_panel=FILES,
+    ),
+]
+Live = Annotated[bool, _plain(LOOP, "--live", "Play in this terminal; write nothing.")]
 
 # --- settings
 

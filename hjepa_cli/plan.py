@@ -201,6 +201,25 @@ def plan_scale(
     )
 
 
+def plan_view(
+    settings: Settings, checkpoint: str | None, out: Path, devices: int, *, live: bool
+) -> Plan:
+    """Plan of ``hjepa view``."""
+    steps, methods = settings.protocol.steps, settings.methods
+    frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
+    return Plan(
+        command="view",
+        reads=[_model(checkpoint, settings)],
+        work=[
+            "fit a linear probe of the state on embeddings",
+            f"drive {devices} devices for {steps} steps with {', '.join(methods)}",
+        ],
+        writes=[] if live else [f"animation {out}"],
+        writes_bytes=0 if live else 10_000 * 100 * devices * len(methods) // 4,
+        seconds=10 + _seconds({"closed-loop frames": frames}),
+    )
+
+
 def size(count: float) -> str:
     """Bytes for people: 12 kB, 3.4 MB."""
     for unit in ("B", "kB", "MB", "GB"):

@@ -1,11 +1,13 @@
-"""Commands beside the pipeline: datasets and settings.
+"""Commands beside the pipeline: pictures, datasets and settings.
 
 As in :mod:`hjepa_cli.cli`, nothing heavy is imported before a command runs.
 """
 
+from pathlib import Path
+
 import typer
 
-from hjepa_cli import options
+from hjepa_cli import options, plan
 from hjepa_cli.command import Result, execute, print_help, resolve
 from hjepa_cli.plan import Plan
 from hjepa_cli.screen import Screen
@@ -140,3 +142,62 @@ def config_show(
         return show(screen, settings, config=config, flags=flags, key=key, as_toml=toml)
 
     execute(screen, stage)
+
+
+def view(
+    methods: options.Methods = "hjepa,hold",
+    devices: options.ViewDevices = 3,
+    snr: options.ViewSnr = 20.0,
+    delivery: options.Delivery = 0.05,
+    gap: options.Gap = None,
+    every: options.Every = None,
+    fps: options.Fps = 20,
+    live: options.Live = False,
+    bandwidth_mhz: options.BandwidthMhz = None,
+    checkpoint: options.Checkpoint = None,
+    out: options.AnimationOut = Path("hjepa-view.gif"),
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Watch closed loops over a fading link: true pole, believed pole, packets, SNR, age."""
+    settings = resolve(
+        preset,
+        config,
+        {
+            "plant": plant,
+            "seed": seed,
+            "device": device,
+            "methods": options.split_names(methods),
+            "radio.bandwidth_hz": None if bandwidth_mhz is None else bandwidth_mhz * 1e6,
+        },
+    )
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.view import run
+
+        return run(
+            settings,
+            screen,
+            checkpoint=checkpoint,
+            out=out,
+            devices=devices,
+            snr_db=snr,
+            delivery=delivery,
+            gap_steps=gap,
+            every=every,
+            fps=fps,
+            live=live,
+        )
+
+    def planned() -> Plan:
+        return plan.plan_view(settings, checkpoint, out, devices, live=live)
+
+    execute(screen, stage, planned, dry_run=dry_run, product=None if live else "file")
