@@ -61,6 +61,17 @@ def one_of(*choices: str) -> Callable[[str], str]:
     return parse
 
 
+def some_of(*choices: str) -> Callable[[str], str]:
+    """Return a parser that takes some of a few words, separated by commas."""
+
+    def parse(text: str) -> str:
+        for name in split_names(text) or [""]:
+            one_of(*choices)(name)
+        return text
+
+    return parse
+
+
 def split_names(text: str | None) -> list[str] | None:
     """``"a, b"`` → ``["a", "b"]``, each once."""
     if text is None:
@@ -356,6 +367,42 @@ Noise = Annotated[
         "Noise power fixed (the paper), or scaled with each device's bandwidth (law equal).",
         "fixed",
         "scaled",
+    ),
+]
+
+# --- report
+
+RunPaths = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Run directories, or directories that hold some. Without one: the newest run of "
+        "each stage.",
+        metavar="[RUN]...",
+        show_default=False,
+        autocompletion=completion.runs,
+    ),
+]
+ReportOut = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        help="HTML file to write; one that is there is replaced.",
+        metavar="FILE",
+        rich_help_panel=FILES,
+    ),
+]
+FigureDirectory = Annotated[
+    Path | None,
+    _plain(FILES, "--figures", "Also write every figure into this directory.", metavar="DIR"),
+]
+FigureFormats = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        help="Format of the figure files: pdf, svg, png, or several separated by commas.",
+        metavar="A,B",
+        parser=some_of("pdf", "svg", "png"),
+        rich_help_panel=FILES,
     ),
 ]
 

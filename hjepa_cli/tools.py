@@ -1,4 +1,4 @@
-"""Commands beside the pipeline: pictures, datasets and settings.
+"""Commands beside the pipeline: reports, pictures, datasets and settings.
 
 As in :mod:`hjepa_cli.cli`, nothing heavy is imported before a command runs.
 """
@@ -201,3 +201,24 @@ def view(
         return plan.plan_view(settings, checkpoint, out, devices, live=live)
 
     execute(screen, stage, planned, dry_run=dry_run, product=None if live else "file")
+
+
+def report(
+    runs: options.RunPaths = None,
+    out: options.ReportOut = Path("report.html"),
+    figures: options.FigureDirectory = None,
+    format: options.FigureFormats = "pdf",
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Write what runs found as one HTML file: figures, tables, settings, commands."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.report import run
+
+        formats = options.split_names(format) or []
+        return run(screen, runs or [], out=out, figures=figures, formats=formats)
+
+    execute(screen, stage, product="report")
