@@ -19,7 +19,7 @@ from hjepa_cli import __version__, options, plan
 from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, resolve
 from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
 from hjepa_cli.screen import Screen, one_line
-from hjepa_cli.tools import config_app, data_app, report, view
+from hjepa_cli.tools import config_app, data_app, report, reproduce, view
 
 PIPELINE, TOOLS = "Pipeline", "Tools"
 STAGES = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
@@ -30,8 +30,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 models_app = typer.Typer(help="List, describe and verify trained models.")
-app.command(rich_help_panel=TOOLS)(view)
-app.command(rich_help_panel=TOOLS)(report)
 app.add_typer(data_app, name="data", rich_help_panel=TOOLS)
 app.add_typer(models_app, name="models", rich_help_panel=TOOLS)
 app.add_typer(config_app, name="config", rich_help_panel=TOOLS)
@@ -372,6 +370,11 @@ def scale(
         ),
         dry_run=dry_run,
     )
+
+
+app.command(rich_help_panel=PIPELINE)(reproduce)
+app.command(rich_help_panel=TOOLS)(view)
+app.command(rich_help_panel=TOOLS)(report)
 
 
 @models_app.callback(invoke_without_command=True)

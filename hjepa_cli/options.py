@@ -408,6 +408,15 @@ FigureFormats = Annotated[
 
 # --- view
 
+ViewMethods = Annotated[
+    str,
+    typer.Option(
+        "--methods",
+        help="Methods on embeddings, one row each, separated by commas.",
+        metavar="A,B,C",
+        rich_help_panel=LOOP,
+    ),
+]
 ViewDevices = Annotated[
     int,
     typer.Option(

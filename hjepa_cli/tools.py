@@ -145,7 +145,7 @@ def config_show(
 
 
 def view(
-    methods: options.Methods = "hjepa,hold",
+    methods: options.ViewMethods = "hjepa,hold",
     devices: options.ViewDevices = 3,
     snr: options.ViewSnr = 20.0,
     delivery: options.Delivery = 0.05,
@@ -222,3 +222,39 @@ def report(
         return run(screen, runs or [], out=out, figures=figures, formats=formats)
 
     execute(screen, stage, product="report")
+
+
+def reproduce(
+    methods: options.Methods = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Run all stages into one folder and write the report."""
+    flags = {
+        "plant": plant,
+        "seed": seed,
+        "device": device,
+        "methods": options.split_names(methods),
+    }
+    settings = resolve(preset, config, flags)
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.reproduce import run
+
+        return run(settings, screen, out=out)
+
+    def planned() -> Plan:
+        from hjepa_cli.stages.reproduce import plan_reproduce
+
+        return plan_reproduce(settings, out)
+
+    execute(screen, stage, planned, dry_run=dry_run, product="report")
