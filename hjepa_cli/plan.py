@@ -201,6 +201,37 @@ def plan_scale(
     )
 
 
+def plan_reproduce(settings: Settings, out: Path | None) -> Plan:
+    """Plan of ``hjepa reproduce``, whose curves are all measured."""
+    parts = reproduce_parts(settings)
+    return Plan(
+        command="reproduce",
+        reads=[],
+        work=[f"{name}: {line}" for name, (lines, _) in parts.items() for line in lines],
+        writes=[f"folder {_run('reproduce', out)} with a report and its figures"],
+        writes_bytes=plan_collect(settings, None).writes_bytes + 24 * ENCODER_PARAMETERS,
+        seconds=15 + sum(seconds for _, seconds in parts.values()),
+    )
+
+
+def reproduce_parts(settings: Settings) -> dict[str, tuple[list[str], float]]:
+    """What each stage of ``hjepa reproduce`` does, and about how many seconds that takes."""
+    training = (
+        plan_collect(settings, None),
+        plan_train_encoder(settings, None, None),
+        plan_train_hierarchy(settings, None, None, None),
+    )
+    methods = list(settings.methods)
+    return {
+        **{part.command: (part.work, part.seconds) for part in training},
+        "eval": (
+            [f"measure the curves of {', '.join(methods)}"],
+            5 + _loop_seconds(settings, methods),
+        ),
+        "scale": (["count devices"], 5.0),
+    }
+
+
 def plan_view(
     settings: Settings, checkpoint: str | None, out: Path, devices: int, *, live: bool
 ) -> Plan:
@@ -209,7 +240,7 @@ def plan_view(
     frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
     return Plan(
         command="view",
-        reads=[_model(checkpoint, settings)],
+        reads=[f"model {_subject(settings, checkpoint, None).name}"],
         work=[
             "fit a linear probe of the state on embeddings",
             f"drive {devices} devices for {steps} steps with {', '.join(methods)}",

@@ -252,9 +252,10 @@ def reproduce(
 
         return run(settings, screen, out=out)
 
-    def planned() -> Plan:
-        from hjepa_cli.stages.reproduce import plan_reproduce
-
-        return plan_reproduce(settings, out)
-
-    execute(screen, stage, planned, dry_run=dry_run, product="report")
+    execute(
+        screen,
+        stage,
+        lambda: plan.plan_reproduce(settings, out),
+        dry_run=dry_run,
+        product="report",
+    )

@@ -14,7 +14,7 @@ from typing import Any
 from hjepa_cli import __version__, html
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen
+from hjepa_cli.screen import Screen, span
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
@@ -219,11 +219,11 @@ def eval_section(result: Mapping[str, Any]) -> list[str]:
             [
                 name,
                 *(float(error) for error in entry["nmae_windows"].values()),
-                spanned(entry["score"], entry["score_ci95"], 3),
+                span(entry["score"], entry["score_ci95"], 3),
                 float(entry["lq_ratio"]),
                 entry["bits_per_transmission"],
-                tolerance(entry, "gap_steps", "gap", 1, "> "),
-                tolerance(entry, "p", "p", 4, "< "),
+                tolerance(entry, "gap_steps", "gap", 1, "≥"),
+                tolerance(entry, "p", "p", 4, "≤"),
             ]
         )
     first = next(iter(result["methods"].values()), None)
@@ -248,19 +248,24 @@ def scale_section(result: Mapping[str, Any]) -> list[str]:
     for row in result["rows"]:
         by_method.setdefault(row["method"], []).append(row)
     grid_db = sorted({row["snr_db"] for row in result["rows"]})
+    ranked = sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
     rows = [
         [
             method,
-            *(spanned(row["devices"], row["devices_ci95"], 0) for row in found),
+            *(
+                span(row["devices"], row["devices_ci95"], 0, "≥" if row["at_least"] else "")
+                for row in found
+            ),
             None if found[0]["bits_per_s"] is None else f"{found[0]['bits_per_s']:,.0f}",
         ]
-        for method, found in by_method.items()
+        for method, found in ranked
     ]
     parts = [
         html.paragraph(
             f"Devices per cell under law {result['law']}: {result['bandwidth_hz'] / 1e6:g} MHz, "
             f"slots of {1e3 * result['slot_s']:g} ms, normalised score of at least "
-            f"{result['acceptable_score']:g}. In brackets: 95 % intervals. Least rate that any "
+            f"{result['acceptable_score']:g}; tolerances from {result['n_devices']} simulated "
+            f"devices, seed {result['seed']}. In brackets: 95 % intervals. Least rate that any "
             f"controller needs: {result['limit_bits_per_s']:.1f} bit/s per device."
         ),
         html.table(["method", *(f"{snr:g} dB" for snr in grid_db), "bit/s per device"], rows),
@@ -337,19 +342,10 @@ SECTIONS: dict[str, tuple[Callable[..., list[str]], Callable[..., Figures]]] = {
 }
 
 
-def spanned(value: float | None, interval: Sequence[float] | None, digits: int) -> str | None:
-    """``112.5 (104.1 – 118.0)``."""
-    if value is None:
-        return None
-    low, high = interval or (value, value)
-    return f"{value:,.{digits}f} ({low:,.{digits}f} – {high:,.{digits}f})"
-
-
 def tolerance(
-    entry: Mapping[str, Any], value_key: str, key: str, digits: int, beyond: str
+    entry: Mapping[str, Any], value_key: str, key: str, decimals: int, beyond: str
 ) -> str | None:
-    """A tolerance with its interval, or the bound where the measured range ended first."""
-    value = entry[f"tolerance_{value_key}"]
-    if value is not None and entry[f"tolerance_{key}_censored"]:
-        return f"{beyond}{value:.{digits}f}"
-    return spanned(value, entry[f"tolerance_{key}_ci95"], digits) if value is not None else None
+    """A tolerance with its interval, marked where the measured range ended first."""
+    bound = beyond if entry[f"tolerance_{key}_censored"] else ""
+    interval = entry[f"tolerance_{key}_ci95"]
+    return span(entry[f"tolerance_{value_key}"], interval, decimals, bound)

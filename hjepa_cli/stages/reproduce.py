@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli import plan
-from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages import (
@@ -39,14 +38,15 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
             return record.result
         folder = record.directory
         work = stages(settings, screen, folder)
-        expected_s = stage_seconds(settings)
+        parts = plan.reproduce_parts(settings)
+        expected_s = {name: round(seconds) for name, (_, seconds) in parts.items()}
         results: Result = {}
-        with screen.progress("reproduce", round(sum(expected_s.values())), "planned s") as bar:
+        with screen.progress("reproduce", sum(expected_s.values()), "planned s") as bar:
             for number, (name, stage) in enumerate(work.items(), start=1):
                 screen.say(f"stage {number} of {len(work)}: {name}")
                 results[name] = stage()
                 record.event("finished", stage=name)
-                bar.advance(round(expected_s[name]))
+                bar.advance(expected_s[name])
         made = report.run(screen, [folder], out=folder / "report.html", figures=folder / "figures")
         return record.finish({"folder": folder, **results, "report": made["report"]})
 
@@ -77,35 +77,3 @@ def stages(settings: Settings, screen: Screen, folder: Path) -> dict[str, Callab
             settings, screen, checkpoint=model, dataset=data, out=folder / "scale"
         ),
     }
-
-
-def stage_seconds(settings: Settings) -> dict[str, float]:
-    """About how long each stage takes, as its own ``--dry-run`` says."""
-    return {name: part.seconds for name, part in plans(settings).items()}
-
-
-def plans(settings: Settings) -> dict[str, plan.Plan]:
-    """The stages' own plans."""
-    grid_db = parse_snr(settings.radio.snr_db)
-    return {
-        "collect": plan.plan_collect(settings, None),
-        "train-encoder": plan.plan_train_encoder(settings, None, None),
-        "train-hierarchy": plan.plan_train_hierarchy(settings, None, None, None),
-        "eval": plan.plan_eval(settings, None, None, None, remeasure=False),
-        "scale": plan.plan_scale(
-            settings, None, None, None, grid_db, remeasure=False, verify=False
-        ),
-    }
-
-
-def plan_reproduce(settings: Settings, out: Path | None) -> plan.Plan:
-    """Plan of ``hjepa reproduce``."""
-    parts = plans(settings)
-    return plan.Plan(
-        command="reproduce",
-        reads=[],
-        work=[f"{name}: {line}" for name, part in parts.items() for line in part.work],
-        writes=[f"folder {out or 'runs/reproduce/<next number>'} with a report and its figures"],
-        writes_bytes=sum(part.writes_bytes for part in parts.values()) + 1_000_000,
-        seconds=sum(part.seconds for part in parts.values()) + 10,
-    )

@@ -22,6 +22,7 @@ from typing import IO, Any, Self
 from hjepa_cli import __version__
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.storage import files
+from hjepa_cli.storage.tracking import tracker
 
 ROOT = Path("runs")
 CONFIG = "config.toml"
@@ -47,6 +48,7 @@ class Run:
         self.result: dict[str, Any] | None = None
         self.resumed = False
         self._lock = lock
+        self._track = tracker(directory)
 
     @classmethod
     def create(
@@ -96,6 +98,8 @@ class Run:
         elif columns != list(row):
             raise ValueError(f"metrics.csv has columns {columns}, not {list(row)}")
         self._append(METRICS, _csv_line([_cell(value) for value in row.values()]))
+        if self._track is not None:
+            self._track(row)
 
     def keep_metrics(self, rows: int) -> None:
         """Forget all but the first ``rows`` rows: those after the checkpoint taken up again."""
