@@ -51,3 +51,4 @@ def test_what_cannot_be_logged_to_is_refused_before_the_run_starts(tmp_path, mon
     with pytest.raises(MissingInputError) as refused:
         run(tmp_path / "r", ROWS)
     assert 'pip install "hjepa[track]"' in (refused.value.hint or "")
+    assert not (tmp_path / "r").exists()

@@ -21,8 +21,7 @@ from typing import IO, Any, Self
 
 from hjepa_cli import __version__
 from hjepa_cli.errors import DataError, UsageError
-from hjepa_cli.storage import files
-from hjepa_cli.storage.tracking import tracker
+from hjepa_cli.storage import files, tracking
 
 ROOT = Path("runs")
 CONFIG = "config.toml"
@@ -48,7 +47,7 @@ class Run:
         self.result: dict[str, Any] | None = None
         self.resumed = False
         self._lock = lock
-        self._track = tracker(directory)
+        self._track: tracking.Tracker | None = None
 
     @classmethod
     def create(
@@ -66,7 +65,9 @@ class Run:
             UsageError: ``out`` holds something else, or a run with other settings.
             LockedError: another process works in it.
             StorageError: not writable.
+            MissingInputError: ``HJEPA_LOG`` asks for a package that is not installed.
         """
+        track = tracking.requested()
         if out is None:
             directory = files.next_directory(root / stage)
         else:
@@ -74,6 +75,7 @@ class Run:
             files.make_directory(directory)
             _refuse_foreign(directory, stage)
         run = cls(directory, files.lock_directory(directory))
+        run._track = track(directory) if track else None
         try:
             run._open(stage, settings)
         except BaseException:

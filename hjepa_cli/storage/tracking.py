@@ -1,12 +1,13 @@
 """Optional copies of a run's metrics for other people's dashboards; off unless asked for.
 
-``HJEPA_LOG=tensorboard`` writes TensorBoard event files into the run directory as it trains. Nothing
-leaves the machine, and no account is asked for. ``metrics.csv`` is written in any case.
+``HJEPA_LOG=tensorboard`` writes TensorBoard event files into the run directory as it trains.
+Nothing leaves the machine, and no account is asked for. ``metrics.csv`` is written in any case.
 """
 
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from hjepa_cli.errors import MissingInputError, UsageError
 
@@ -16,8 +17,8 @@ Tracker = Callable[[Mapping[str, int | float | str | None]], None]
 """Takes one row of ``metrics.csv``."""
 
 
-def tracker(directory: Path) -> Tracker | None:
-    """What ``HJEPA_LOG`` asks for, if anything.
+def requested() -> Callable[[Path], Tracker] | None:
+    """What ``HJEPA_LOG`` asks for, if anything: from a run directory to its tracker.
 
     Raises:
         UsageError: an unknown logger.
@@ -38,13 +39,17 @@ def tracker(directory: Path) -> Tracker | None:
             f"{VARIABLE}=tensorboard needs tensorboard, which is not installed",
             hint=f'pip install "hjepa[track]", or unset {VARIABLE}',
         ) from None
-    writer: SummaryWriter | None = None
+    return lambda directory: _tensorboard(SummaryWriter, directory)
+
+
+def _tensorboard(open_writer: Callable[..., Any], directory: Path) -> Tracker:
+    writer: Any = None
 
     def track(row: Mapping[str, int | float | str | None]) -> None:
         nonlocal writer
         step = int(row.get("step") or 0)
         if writer is None:  # what an interrupted run has logged beyond this step is discarded
-            writer = SummaryWriter(str(directory), purge_step=step)
+            writer = open_writer(str(directory), purge_step=step)
         group = f"{row['level']}/" if row.get("level") else ""
         for name, value in row.items():
             if name != "step" and isinstance(value, int | float):
