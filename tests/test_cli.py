@@ -38,7 +38,7 @@ MODULES = {
 }
 COMMANDS = [[], *([name] for name in MODULES), ["models"], ["data"], ["config"]]
 COMMANDS += [["models", name] for name in ("list", "info", "verify")]
-COMMANDS += [["data", "export"], ["config", "show"]]
+COMMANDS += [["data", "export"], ["config", "show"], ["reproduce"], ["view"], ["report"]]
 HEAVY = ("torch", "pymunk", "scipy", "matplotlib", "numpy")
 
 

@@ -33,7 +33,8 @@ def fit_probe(z: Tensor, states: Tensor) -> Tensor:
     # A tiny ridge keeps collapsed embeddings solvable; 1e-6 of the mean square moves no healthy R².
     gram = design.T @ design
     ridge = 1e-6 * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
-    return torch.linalg.solve(gram + ridge, design.T @ states.double())
+    weights: Tensor = torch.linalg.solve(gram + ridge, design.T @ states.double())
+    return weights
 
 
 def read_probe(weights: Tensor, z: Tensor) -> Tensor:
