@@ -41,7 +41,8 @@ def commands():
         lines = re.findall(r"^ {4}(?:\.venv/bin/)?(hjepa [^\n#]*)", text, re.MULTILINE)
         lines += re.findall(r"`(hjepa [^`\n]+)`", text)
         for line in lines:
-            if not PLACEHOLDER.search(line):
+            changes_the_shell = line.startswith("hjepa --")
+            if not PLACEHOLDER.search(line) and not changes_the_shell:
                 found.setdefault(line.strip(), page)
     return sorted(found.items())
 
