@@ -1,3 +1,75 @@
-"""hjepa: semantic predictive control over wireless links with a hierarchical JEPA."""
+"""hjepa: semantic predictive control over wireless links with a hierarchical JEPA.
+
+The names in ``__all__`` are the public Python interface; each is imported when it is first used, so
+that ``import hjepa_cli`` costs nothing. Examples: docs/python.md.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "Camera": "hjepa_cli.core.camera",
+    "CartPole": "hjepa_cli.core.plant",
+    "Model": "hjepa_cli.core.model",
+    "collect": "hjepa_cli.api",
+    "drive": "hjepa_cli.api",
+    "evaluate": "hjepa_cli.api",
+    "load_dataset": "hjepa_cli.api",
+    "load_model": "hjepa_cli.api",
+    "load_settings": "hjepa_cli.settings",
+    "predict": "hjepa_cli.api",
+    "scale": "hjepa_cli.api",
+    "teacher": "hjepa_cli.core.policy",
+    "train_encoder": "hjepa_cli.api",
+    "train_hierarchy": "hjepa_cli.api",
+}
+
+if TYPE_CHECKING:
+    from hjepa_cli.api import (
+        collect,
+        drive,
+        evaluate,
+        load_dataset,
+        load_model,
+        predict,
+        scale,
+        train_encoder,
+        train_hierarchy,
+    )
+    from hjepa_cli.core.camera import Camera
+    from hjepa_cli.core.model import Model
+    from hjepa_cli.core.plant import CartPole
+    from hjepa_cli.core.policy import teacher
+    from hjepa_cli.settings import load_settings
+
+__all__ = [
+    "Camera",
+    "CartPole",
+    "Model",
+    "collect",
+    "drive",
+    "evaluate",
+    "load_dataset",
+    "load_model",
+    "load_settings",
+    "predict",
+    "scale",
+    "teacher",
+    "train_encoder",
+    "train_hierarchy",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name at its first use."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'hjepa_cli' has no attribute '{name}'")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

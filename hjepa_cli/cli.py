@@ -9,24 +9,19 @@ import io
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from collections.abc import Sequence
+from typing import Annotated, NoReturn
 
 import typer
 from typer.main import get_command
 
 from hjepa_cli import __version__, options, plan
-from hjepa_cli.checks import check_settings
-from hjepa_cli.errors import DataError, HjepaError, Interrupted, StorageError, UsageError
-from hjepa_cli.interrupts import exit_code, sigterm_raises
+from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, resolve
+from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
 from hjepa_cli.screen import Screen, one_line
-from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.tools import config_app, data_app, report, reproduce, view
 
-Result = dict[str, Any]
-
-PIPELINE = "Pipeline"
+PIPELINE, TOOLS = "Pipeline", "Tools"
 STAGES = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
 
 app = typer.Typer(
@@ -35,13 +30,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 models_app = typer.Typer(help="List, describe and verify trained models.")
-app.add_typer(models_app, name="models", rich_help_panel="Models")
-
-
-class PipeClosed(HjepaError):
-    """Whoever read our output has gone, as in ``hjepa scale | head -1``: end without a word."""
-
-    exit_code = StorageError.exit_code
+app.add_typer(data_app, name="data", rich_help_panel=TOOLS)
+app.add_typer(models_app, name="models", rich_help_panel=TOOLS)
+app.add_typer(config_app, name="config", rich_help_panel=TOOLS)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -79,8 +70,9 @@ def _run_command(argv: list[str]) -> int:
 
 def _expected(error: Exception, argv: list[str]) -> HjepaError:
     """Every exception as one of ours: a message, a hint and an exit code."""
-    command = next((word for word in argv if word in (*STAGES, "models")), None)
-    usage = f"hjepa {command} --help" if command else f"commands: {', '.join(STAGES)}, models"
+    names = list(get_command(app).commands)  # type: ignore[attr-defined]
+    command = next((word for word in argv if word in names), None)
+    usage = f"hjepa {command} --help" if command else f"commands: {', '.join(names)}"
     if isinstance(error, HjepaError):
         if error.hint is None:
             again = "restore the file or make it again; what this command reads: "
@@ -98,73 +90,6 @@ def _expected(error: Exception, argv: list[str]) -> HjepaError:
         f"unexpected {type(error).__name__}: {first_line}",
         hint="run it again with --debug (or HJEPA_DEBUG=1) to see the traceback, and report it",
     )
-
-
-def _settings(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -> Settings:
-    """Merge preset, file and flags; refuse values that make no sense before anything is touched.
-
-    A plant has its own ranges and noise, so ``--plant gym`` alone means its preset.
-    """
-    plant = flags["plant"]
-    if preset is None and plant == "gym":
-        preset = "gym"
-    settings = load_settings(preset, config, flags)
-    if plant is not None and (preset == "gym") != (plant == "gym"):
-        raise UsageError(
-            f"preset '{settings.preset}' holds the ranges and noise of the other plant, "
-            f"not of '{plant}'",
-            hint="--preset gym for plant gym, and --config FILE.toml for other values of it",
-        )
-    check_settings(settings)
-    return settings
-
-
-def _execute(
-    screen: Screen,
-    stage: Callable[[], Result],
-    planned: Callable[[], plan.Plan] | None = None,
-    *,
-    dry_run: bool = False,
-    product: str | None = None,
-) -> None:
-    """Run a stage, or show its plan, and print what it returns.
-
-    Args:
-        stage: the work.
-        planned: its plan.
-        dry_run: show the plan only.
-        product: key of the result that a quiet run prints: the path that it made.
-    """
-    with _guard():
-        if dry_run and planned is not None:
-            planned().show(screen)
-            return
-        result = stage()
-        if screen.json:
-            screen.emit(result)
-        elif screen.quiet and product is not None:  # otherwise the stage has said where it is
-            screen.result(str(result[product]))
-
-
-@contextmanager
-def _guard() -> Iterator[None]:
-    """Catch what Typer would turn into exit codes of its own."""
-    try:
-        with sigterm_raises():
-            yield
-    except KeyboardInterrupt as error:
-        raise Interrupted(
-            "interrupted", hint="run the same command again", code=exit_code(error)
-        ) from None
-    except BrokenPipeError:
-        raise PipeClosed("output closed") from None
-
-
-def _print_help(context: typer.Context) -> None:
-    """A command group on its own shows its help."""
-    if context.invoked_subcommand is None:
-        print(context.get_help())
-        raise typer.Exit()
 
 
 def _print_version(wanted: bool) -> None:
@@ -191,7 +116,7 @@ def root(
         ),
     ] = False,
 ) -> None:
-    _print_help(context)
+    print_help(context)
 
 
 @app.command(rich_help_panel=PIPELINE)
@@ -213,7 +138,7 @@ def collect(
     debug: options.Debug = False,
 ) -> None:
     """Simulate cart-poles under an exploring teacher and store them as a dataset."""
-    settings = _settings(
+    settings = resolve(
         preset,
         config,
         {
@@ -234,7 +159,7 @@ def collect(
         with placed(workers, cluster):
             return run(settings, screen, out=out)
 
-    _execute(
+    execute(
         screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run, product="dataset"
     )
 
@@ -257,7 +182,7 @@ def train_encoder(
     debug: options.Debug = False,
 ) -> None:
     """Learn an encoder of camera frames with a joint-embedding predictive objective."""
-    settings = _settings(
+    settings = resolve(
         preset,
         config,
         {
@@ -276,7 +201,7 @@ def train_encoder(
 
         return run(settings, screen, dataset=dataset, out=out)
 
-    _execute(
+    execute(
         screen,
         stage,
         lambda: plan.plan_train_encoder(settings, dataset, out),
@@ -304,7 +229,7 @@ def train_hierarchy(
     debug: options.Debug = False,
 ) -> None:
     """Train the three predictors of the hierarchy, the flat baseline and the semantic actor."""
-    settings = _settings(
+    settings = resolve(
         preset,
         config,
         {
@@ -323,7 +248,7 @@ def train_hierarchy(
 
         return run(settings, screen, dataset=dataset, encoder=encoder, out=out)
 
-    _execute(
+    execute(
         screen,
         stage,
         lambda: plan.plan_train_hierarchy(settings, dataset, encoder, out),
@@ -354,7 +279,7 @@ def evaluate(
     debug: options.Debug = False,
 ) -> None:
     """Measure prediction error, control score and tolerated losses of each method."""
-    settings = _settings(
+    settings = resolve(
         preset,
         config,
         {
@@ -382,7 +307,7 @@ def evaluate(
                 remeasure=remeasure,
             )
 
-    _execute(
+    execute(
         screen,
         stage,
         lambda: plan.plan_eval(settings, checkpoint, dataset, out, remeasure=remeasure),
@@ -417,7 +342,7 @@ def scale(
     debug: options.Debug = False,
 ) -> None:
     """Count the devices that one radio cell supports, by method and signal-to-noise ratio."""
-    settings = _settings(
+    settings = resolve(
         preset,
         config,
         {
@@ -434,7 +359,7 @@ def scale(
         },
     )
     screen = Screen(quiet, as_json)
-    with _guard():
+    with guard():
         from hjepa_cli.core.capacity import parse_snr
 
         snr_db = parse_snr(settings.radio.snr_db)
@@ -454,7 +379,7 @@ def scale(
                 verify=verify,
             )
 
-    _execute(
+    execute(
         screen,
         stage,
         lambda: plan.plan_scale(
@@ -483,12 +408,17 @@ def resume(
         with placed(workers, cluster):
             return run(directory, screen)
 
-    _execute(screen, stage)
+    execute(screen, stage)
+
+
+app.command(rich_help_panel=PIPELINE)(reproduce)
+app.command(rich_help_panel=TOOLS)(view)
+app.command(rich_help_panel=TOOLS)(report)
 
 
 @models_app.callback(invoke_without_command=True)
 def models(context: typer.Context) -> None:
-    _print_help(context)
+    print_help(context)
 
 
 @models_app.command("list")
@@ -503,7 +433,7 @@ def list_models(
 
         return show_list(screen)
 
-    _execute(screen, stage)
+    execute(screen, stage)
 
 
 @models_app.command()
@@ -521,7 +451,7 @@ def info(
 
         return show_info(screen, name)
 
-    _execute(screen, stage)
+    execute(screen, stage)
 
 
 @models_app.command()
@@ -539,4 +469,4 @@ def verify(
 
         return verify(screen, names or [])
 
-    _execute(screen, stage)
+    execute(screen, stage)

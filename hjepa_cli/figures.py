@@ -22,6 +22,7 @@ from hjepa_cli.storage.files import write_bytes
 WIDTH_IN = 3.5  # an IEEE column
 DPI = 300
 MARKERS = 8  # per line at most
+ZERO_ERROR = 1e-5  # NMAE below which a method plays what the teacher plays
 RC: dict[Any, Any] = {
     "font.size": 8,
     "axes.labelsize": 8,
@@ -105,11 +106,16 @@ def save(figure: Figure, path: Path) -> Path:
     kind = path.suffix.removeprefix(".")
     if kind not in METADATA:
         raise UsageError(f"no figure format '{path.suffix}'; choose one of .png, .svg, .pdf")
+    write_bytes(path, encoded(figure, kind))
+    return path
+
+
+def encoded(figure: Figure, kind: str) -> bytes:
+    """A figure as ``"png"``, ``"svg"`` or ``"pdf"``."""
     buffer = io.BytesIO()
     with matplotlib.rc_context(RC):
         figure.savefig(buffer, format=kind, dpi=DPI, metadata=METADATA[kind])
-    write_bytes(path, buffer.getvalue())
-    return path
+    return buffer.getvalue()
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
@@ -161,3 +167,158 @@ def _scale_counts(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     else:
         axes.set_ylim(0, 1.1 * most)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+
+
+def score_figure(
+    entries: Mapping[str, Mapping[str, Any]],
+    kind: str,
+    *,
+    acceptable_score: float,
+    step_s: float,
+    title: str = "",
+) -> Figure:
+    """Draw the normalised score against the link, one line per method with its 95 % band.
+
+    Args:
+        entries: of ``eval --json``, by method: ``gap_curve`` or ``delivery_curve``.
+        kind: ``"gap"``: against the time between packets; ``"delivery"``: against p.
+        acceptable_score: drawn as a level.
+        step_s: length of a control step, for the time axis.
+        title: one line above the axes.
+    """
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
+        axes = figure.add_subplot()
+        axes.axhline(acceptable_score, color="black", linewidth=0.6, linestyle=(0, (6, 3)))
+        axes.annotate(
+            f"acceptable: {acceptable_score:g}",
+            (0.01, acceptable_score),
+            xycoords=("axes fraction", "data"),
+            xytext=(2, 2),
+            textcoords="offset points",
+            fontsize=6,
+        )
+        for method, entry in entries.items():
+            curve = entry[f"{kind}_curve"]
+            if len(curve) < 2 or entry["tolerance_gap_steps"] is None:
+                continue  # a method without a link (optimal) is a line at 1
+            where = [1e3 * step_s * point["d"] if kind == "gap" else point["p"] for point in curve]
+            band = np.array([point["ci95"] for point in curve], float)
+            scores = np.array([point["score"] for point in curve], float)
+            _line(axes, method, list(entries), np.array(where), scores, band)
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        if kind == "gap":
+            axes.set_xlabel("Time between packets (ms)")
+        else:
+            axes.set_xlabel("Delivery probability of a slot")
+            axes.invert_xaxis()
+        axes.set_ylabel("Normalised control score")
+        axes.set_ylim(bottom=0)
+        _finish(figure, axes, title)
+        return figure
+
+
+def error_figure(
+    entries: Mapping[str, Mapping[str, Any]], *, step_s: float, title: str = ""
+) -> Figure:
+    """Draw the NMAE after a single packet against the time since it, with 95 % bands.
+
+    Args:
+        entries: of ``eval --json``, by method: ``nmae`` and ``nmae_ci95`` over the horizon.
+        step_s: length of a control step.
+        title: one line above the axes.
+    """
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
+        axes = figure.add_subplot()
+        for method, entry in entries.items():
+            errors = np.array(entry["nmae"], float)
+            if errors.max() < ZERO_ERROR:
+                continue  # oracle and optimal know the noise-free future but for rounding
+            band = np.array(entry["nmae_ci95"], float)
+            _line(axes, method, list(entries), 1e3 * step_s * np.arange(len(errors)), errors, band)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        shown = np.concatenate([line.get_ydata() for line in axes.lines] or [np.ones(1)])
+        axes.set_ylim(bottom=0.5 * shown[shown > ZERO_ERROR].min())
+        axes.set_xlabel("Time since the only packet (ms)")
+        axes.set_ylabel("NMAE of the force")
+        _finish(figure, axes, title)
+        return figure
+
+
+def training_figure(rows: Sequence[Mapping[str, str]], *, title: str = "") -> Figure:
+    """Draw a training run's ``metrics.csv``: losses, and health where it was measured.
+
+    Args:
+        rows: as :class:`csv.DictReader` gives them, with ``step`` and either ``loss_…`` and
+            ``probe_r2_…`` columns, or ``level`` and ``loss``.
+        title: one line above the axes.
+    """
+    losses = _series(rows, "loss")
+    health = _series(rows, "probe_r2")
+    with matplotlib.rc_context(RC):
+        count = 1 + bool(health)
+        figure = Figure(figsize=(WIDTH_IN, 1.2 + 1.4 * count), layout="constrained")
+        panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+        for axes, lines, label in zip(panels, (losses, health), ("Loss", "Probe R²"), strict=False):
+            for number, (name, points) in enumerate(lines.items()):
+                style = list(STYLES.values())[number % len(STYLES)]
+                axes.plot(
+                    *np.array(points).T,
+                    color=style.colour,
+                    linestyle=style.line,
+                    marker=style.marker,
+                    markerfacecolor="none",
+                    markersize=4,
+                    markevery=max(-(-len(points) // MARKERS), 1),
+                    label=name,
+                )
+            axes.set_ylabel(label)
+            axes.grid(visible=True)
+            axes.legend(fontsize=6, ncols=2, frameon=False, handlelength=2.4)
+        if all(value > 0 for points in losses.values() for _, value in points):
+            panels[0].set_yscale("log")
+        panels[0].set_title(title)
+        panels[-1].set_xlabel("Training step")
+        return figure
+
+
+def _series(rows: Sequence[Mapping[str, str]], prefix: str) -> dict[str, list[tuple[float, float]]]:
+    """Columns of ``metrics.csv`` by name without their prefix; by level where there are levels."""
+    series: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        for column, text in row.items():
+            if column.startswith(prefix) and text:
+                name = row.get("level") or column.removeprefix(prefix).strip("_") or column
+                series.setdefault(name, []).append((float(row["step"]), float(text)))
+    return series
+
+
+def _line(
+    axes: Axes, method: str, methods: list[str], where: np.ndarray, value: np.ndarray,
+    band: np.ndarray,
+) -> None:  # fmt: skip
+    """One method's line, markers and band [points, 2]."""
+    style = _style(method, methods)
+    axes.plot(
+        where,
+        value,
+        color=style.colour,
+        linestyle=style.line,
+        marker=style.marker,
+        markerfacecolor="none" if style.hollow else style.colour,
+        markevery=-(-len(where) // MARKERS),
+        markersize=5.5 if style.hollow else 3.5,
+        label=method,
+    )
+    axes.fill_between(where, band[:, 0], band[:, 1], color=style.colour, alpha=0.18, linewidth=0)
+
+
+def _finish(figure: Figure, axes: Axes, title: str) -> None:
+    axes.set_title(title)
+    axes.grid(visible=True)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=2.4)

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hjepa_cli import completion
 from hjepa_cli.checks import METHODS
 from hjepa_cli.settings import PRESETS
 
@@ -31,7 +32,7 @@ def whole_number(minimum: int) -> Callable[[str], int]:
     return parse
 
 
-def number(minimum: float) -> Callable[[str], float]:
+def number(minimum: float, maximum: float = float("inf")) -> Callable[[str], float]:
     """Return a parser of finite numbers of at least ``minimum``; NaN is refused."""
 
     def parse(text: str) -> float:
@@ -39,9 +40,34 @@ def number(minimum: float) -> Callable[[str], float]:
             value = float(text)
         except ValueError:
             value = float("nan")
-        if not minimum <= value < float("inf"):
-            raise typer.BadParameter(f"'{text}' is not a finite number of at least {minimum:g}")
+        if not (minimum <= value <= maximum and value < float("inf")):
+            most = f" and at most {maximum:g}" if maximum < float("inf") else ""
+            raise typer.BadParameter(
+                f"'{text}' is not a finite number of at least {minimum:g}{most}"
+            )
         return value
+
+    return parse
+
+
+def one_of(*choices: str) -> Callable[[str], str]:
+    """Return a parser that takes one of a few words."""
+
+    def parse(text: str) -> str:
+        if text not in choices:
+            raise typer.BadParameter(f"'{text}' is not one of {', '.join(choices)}")
+        return text
+
+    return parse
+
+
+def some_of(*choices: str) -> Callable[[str], str]:
+    """Return a parser that takes some of a few words, separated by commas."""
+
+    def parse(text: str) -> str:
+        for name in split_names(text) or [""]:
+            one_of(*choices)(name)
+        return text
 
     return parse
 
@@ -111,6 +137,7 @@ Encoder = Annotated[
         "--encoder",
         "Encoder to build on: a zoo name or a path. Without it: that of the newest run.",
         metavar="NAME|PATH",
+        autocompletion=completion.models,
     ),
 ]
 Checkpoint = Annotated[
@@ -120,6 +147,7 @@ Checkpoint = Annotated[
         "--checkpoint",
         "Model to use: a zoo name or a path. Without it: the newest run's, else the zoo's.",
         metavar="NAME|PATH",
+        autocompletion=completion.models,
     ),
 ]
 
@@ -127,11 +155,40 @@ RunDirectory = Annotated[
     Path, typer.Argument(help="The run's directory.", metavar="RUN", show_default=False)
 ]
 ModelName = Annotated[
-    str, typer.Argument(help="A zoo name or a path.", metavar="NAME|PATH", show_default=False)
+    str,
+    typer.Argument(
+        help="A zoo name or a path.",
+        metavar="NAME|PATH",
+        show_default=False,
+        autocompletion=completion.models,
+    ),
 ]
 ModelNames = Annotated[
     list[str] | None,
-    typer.Argument(help="Zoo names or paths.", metavar="[NAME|PATH]...", show_default=False),
+    typer.Argument(
+        help="Zoo names or paths.",
+        metavar="[NAME|PATH]...",
+        show_default=False,
+        autocompletion=completion.models,
+    ),
+]
+DatasetPath = Annotated[
+    Path | None,
+    typer.Argument(
+        help="Dataset to look at. Without it: the newest in data/.",
+        metavar="[DIR]",
+        show_default=False,
+        autocompletion=completion.datasets,
+    ),
+]
+DatasetPaths = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Datasets to check. Without one: all in data/.",
+        metavar="[DIR]...",
+        show_default=False,
+        autocompletion=completion.datasets,
+    ),
 ]
 
 # --- data
@@ -151,6 +208,68 @@ Frames = Annotated[
         "Render camera frames when they are read, or store them with the states.",
         "rendered",
         "stored",
+    ),
+]
+
+Split = Annotated[
+    str,
+    typer.Option(
+        "--split",
+        help="Which trajectories.",
+        metavar="train|test|clean",
+        parser=one_of("train", "test", "clean"),
+        rich_help_panel=DATA,
+        autocompletion=lambda: ["train", "test", "clean"],
+    ),
+]
+SheetRows = Annotated[
+    int,
+    typer.Option(
+        "--rows",
+        help="Trajectories shown, one per row.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=DATA,
+    ),
+]
+SheetColumns = Annotated[
+    int,
+    typer.Option(
+        "--columns",
+        help="Frames per trajectory.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=DATA,
+    ),
+]
+ExportFormat = Annotated[
+    str | None,
+    typer.Option(
+        "--format",
+        help="hdf5: the layout of stable-worldmodel (needs h5py); npz: the same columns for numpy. "
+        "Without it: by the suffix of --out.",
+        metavar="hdf5|npz",
+        parser=one_of("hdf5", "npz"),
+        rich_help_panel=DATA,
+        show_default=False,
+        autocompletion=lambda: ["hdf5", "npz"],
+    ),
+]
+Pixels = Annotated[
+    bool,
+    typer.Option(
+        "--pixels/--no-pixels",
+        help="With the camera frames (rendered now unless they are stored), or states only.",
+        rich_help_panel=DATA,
+    ),
+]
+FileOut = Annotated[
+    Path | None,
+    _plain(
+        FILES,
+        "--out",
+        "File to write; one that is there is replaced.",
+        metavar="FILE",
     ),
 ]
 
@@ -254,6 +373,124 @@ Noise = Annotated[
     ),
 ]
 
+# --- report
+
+RunPaths = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Run directories, or directories that hold some. Without one: the newest run of "
+        "each stage.",
+        metavar="[RUN]...",
+        show_default=False,
+        autocompletion=completion.runs,
+    ),
+]
+ReportOut = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        help="HTML file to write; one that is there is replaced.",
+        metavar="FILE",
+        rich_help_panel=FILES,
+    ),
+]
+FigureDirectory = Annotated[
+    Path | None,
+    _plain(FILES, "--figures", "Also write every figure into this directory.", metavar="DIR"),
+]
+FigureFormats = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        help="Format of the figure files: pdf, svg, png, or several separated by commas.",
+        metavar="A,B",
+        parser=some_of("pdf", "svg", "png"),
+        rich_help_panel=FILES,
+    ),
+]
+
+# --- view
+
+ViewMethods = Annotated[
+    str,
+    typer.Option(
+        "--methods",
+        help="Methods on embeddings, one row each, separated by commas.",
+        metavar="A,B,C",
+        rich_help_panel=LOOP,
+    ),
+]
+ViewDevices = Annotated[
+    int,
+    typer.Option(
+        "--devices",
+        help="Devices side by side.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=LOOP,
+    ),
+]
+ViewSnr = Annotated[
+    float,
+    typer.Option(
+        "--snr",
+        help="Mean signal-to-noise ratio in dB.",
+        metavar="DB",
+        parser=number(-100.0, 100.0),
+        rich_help_panel=RADIO,
+    ),
+]
+Delivery = Annotated[
+    float,
+    typer.Option(
+        "--delivery",
+        help="Share of packets that arrive over the fading link.",
+        metavar="P",
+        parser=number(1e-6, 1 - 1e-6),
+        rich_help_panel=RADIO,
+    ),
+]
+Gap = Annotated[
+    float | None,
+    _plain(
+        RADIO,
+        "--gap",
+        "Instead of fading: a packet every so many steps.",
+        metavar="STEPS",
+        parser=number(1.0),
+    ),
+]
+Every = Annotated[
+    int | None,
+    _plain(
+        LOOP,
+        "--every",
+        "Control steps between pictures. Without it: a hundred pictures in all.",
+        metavar="STEPS",
+        parser=whole_number(1),
+    ),
+]
+Fps = Annotated[
+    int,
+    typer.Option(
+        "--fps",
+        help="Pictures per second.",
+        metavar="N",
+        parser=whole_number(1),
+        rich_help_panel=LOOP,
+    ),
+]
+AnimationOut = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        help="File to write, .gif or .mp4; one that is there is replaced.",
+        metavar="FILE",
+        rich_help_panel=FILES,
+    ),
+]
+Live = Annotated[bool, _plain(LOOP, "--live", "Play in this terminal; write nothing.")]
+
 # --- settings
 
 Preset = Annotated[
@@ -281,6 +518,18 @@ PlantName = Annotated[
     _one_of(SETTINGS, "--plant", "Cart-pole to work with.", "desktop", "gym"),
 ]
 Seed = Annotated[int | None, _count(SETTINGS, "--seed", "Seed of everything random.", minimum=0)]
+SettingPrefix = Annotated[
+    str,
+    typer.Argument(
+        help="Only this section or value, as protocol or protocol.steps.",
+        metavar="[KEY]",
+        show_default=False,
+        autocompletion=completion.settings,
+    ),
+]
+Toml = Annotated[
+    bool, _plain(SETTINGS, "--toml", "As TOML that --config accepts, without origins.")
+]
 Device = Annotated[
     str | None,
     _one_of(SETTINGS, "--device", "Where to compute; auto: cuda if there.", "auto", "cpu", "cuda"),

@@ -205,6 +205,56 @@ def plan_scale(
     )
 
 
+def plan_reproduce(settings: Settings, out: Path | None) -> Plan:
+    """Plan of ``hjepa reproduce``, whose curves are all measured."""
+    parts = reproduce_parts(settings)
+    return Plan(
+        command="reproduce",
+        reads=[],
+        work=[f"{name}: {line}" for name, (lines, _) in parts.items() for line in lines],
+        writes=[f"folder {_run('reproduce', out)} with a report and its figures"],
+        writes_bytes=plan_collect(settings, None).writes_bytes + 24 * ENCODER_PARAMETERS,
+        seconds=15 + sum(seconds for _, seconds in parts.values()),
+    )
+
+
+def reproduce_parts(settings: Settings) -> dict[str, tuple[list[str], float]]:
+    """What each stage of ``hjepa reproduce`` does, and about how many seconds that takes."""
+    training = (
+        plan_collect(settings, None),
+        plan_train_encoder(settings, None, None),
+        plan_train_hierarchy(settings, None, None, None),
+    )
+    methods = list(settings.methods)
+    return {
+        **{part.command: (part.work, part.seconds) for part in training},
+        "eval": (
+            [f"measure the curves of {', '.join(methods)}"],
+            5 + _loop_seconds(settings, methods),
+        ),
+        "scale": (["count devices"], 5.0),
+    }
+
+
+def plan_view(
+    settings: Settings, checkpoint: str | None, out: Path, devices: int, *, live: bool
+) -> Plan:
+    """Plan of ``hjepa view``."""
+    steps, methods = settings.protocol.steps, settings.methods
+    frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
+    return Plan(
+        command="view",
+        reads=[f"model {_subject(settings, checkpoint, None).name}"],
+        work=[
+            "fit a linear probe of the state on embeddings",
+            f"drive {devices} devices for {steps} steps with {', '.join(methods)}",
+        ],
+        writes=[] if live else [f"animation {out}"],
+        writes_bytes=0 if live else 10_000 * 100 * devices * len(methods) // 4,
+        seconds=10 + _seconds({"closed-loop frames": frames}),
+    )
+
+
 def size(count: float) -> str:
     """Bytes for people: 12 kB, 3.4 MB."""
     for unit in ("B", "kB", "MB", "GB"):

@@ -57,6 +57,11 @@ class Screen:
         self._stderr = stderr or sys.stderr
         self._bars: RichProgress | None = None
 
+    @property
+    def is_terminal(self) -> bool:
+        """Somebody watches, in a window where pictures can be redrawn."""
+        return _is_terminal(self._results)
+
     def say(self, text: str) -> None:
         """Print one line about the work; silent when quiet."""
         if self.quiet:

@@ -191,18 +191,57 @@ def load_settings(
         DataError: the config file is not TOML.
     """
     name = preset or "default"
-    if name not in PRESETS:
-        raise UsageError(f"unknown preset '{name}'; choose one of {', '.join(PRESETS)}")
-    values = _read_preset("default")
-    if name != "default":
-        _override(values, _read_preset(name), f"preset {name}")
+    values: dict[str, Any] = {}
+    for source, changes in _layers(name, config, flags or {}):
+        if values:
+            _override(values, changes, source)
+        else:
+            values = changes
+    return _build(Settings, values | {"preset": name}, "")
+
+
+def origins(
+    preset: str | None = None,
+    config: Path | None = None,
+    flags: Mapping[str, Any] | None = None,
+) -> dict[str, str]:
+    """Where each value of :func:`load_settings` comes from.
+
+    Returns:
+        Dotted key to ``"default"``, ``"preset NAME"``, the config file's path or ``"flag"``.
+
+    Raises:
+        As :func:`load_settings`.
+    """
+    layers = _layers(preset or "default", config, flags or {})
+    return {key: source for source, changes in layers for key in _dotted(changes)}
+
+
+def _layers(
+    preset: str, config: Path | None, flags: Mapping[str, Any]
+) -> list[tuple[str, dict[str, Any]]]:
+    """What defines the settings, weakest first: a source and the values it sets."""
+    if preset not in PRESETS:
+        raise UsageError(f"unknown preset '{preset}'; choose one of {', '.join(PRESETS)}")
+    layers = [("default", _read_preset("default"))]
+    if preset != "default":
+        layers.append((f"preset {preset}", _read_preset(preset)))
     if config is not None:
-        _override(values, _read_config(config), str(config))
-    for key, value in (flags or {}).items():
+        layers.append((str(config), _read_config(config)))
+    for key, value in flags.items():
         if value is not None:
             section, _, field = key.rpartition(".")
-            _override(values, {section: {field: value}} if section else {field: value}, "flag")
-    return _build(Settings, values | {"preset": name}, "")
+            layers.append(("flag", {section: {field: value}} if section else {field: value}))
+    return layers
+
+
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Dotted keys of nested values."""
+    keys: list[str] = []
+    for key, value in values.items():
+        nested = isinstance(value, Mapping)
+        keys += _dotted(value, f"{prefix}{key}.") if nested else [prefix + key]
+    return keys
 
 
 def _read_preset(name: str) -> dict[str, Any]:

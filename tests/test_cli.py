@@ -36,8 +36,9 @@ MODULES = {
     "eval": "evaluate",
     "scale": "scale",
 }
-COMMANDS = [[], *([name] for name in MODULES), ["models"]]
+COMMANDS = [[], *([name] for name in MODULES), ["models"], ["data"], ["config"]]
 COMMANDS += [["models", name] for name in ("list", "info", "verify")]
+COMMANDS += [["data", "export"], ["config", "show"], ["reproduce"], ["view"], ["report"]]
 HEAVY = ("torch", "pymunk", "scipy", "matplotlib", "numpy")
 
 
@@ -160,7 +161,7 @@ def test_defaults_are_in_the_presets_and_not_in_the_signatures():
             assert parameter.default is (False if switch else None), f"{name} {parameter.name}"
 
 
-@pytest.mark.parametrize("arguments", [[], ["models"]])
+@pytest.mark.parametrize("arguments", [[], ["models"], ["data"], ["config"]])
 def test_a_group_alone_shows_its_help(shell, arguments):
     outcome = shell(*arguments)
     assert outcome.code == 0 and "Usage:" in outcome.out and outcome.err == ""

@@ -41,6 +41,7 @@ class StrideController:
         self._planner = planner
         self._forces_n = torch.zeros(devices, planner.stride)
         self._anchors = torch.zeros(devices, 0)  # takes its width from the first packets
+        self._starts = self._anchors
         self._phase = np.full(devices, planner.stride)
 
     @torch.inference_mode()
@@ -52,16 +53,28 @@ class StrideController:
         if packets is not None:
             if not self._anchors.shape[1]:
                 self._anchors = packets.new_zeros(len(delivered), packets.shape[1])
+                self._starts = self._anchors.clone()
             self._anchors[torch.from_numpy(delivered)] = packets
         due = np.flatnonzero(delivered | (self._phase == self._planner.stride))
         if len(due):
             rows = torch.from_numpy(due)
+            self._starts[rows] = self._anchors[rows]
             forces_n, self._anchors[rows] = self._planner.plan(self._anchors[rows])
             self._forces_n[rows] = forces_n.float().cpu()
             self._phase[due] = 0
         played = self._forces_n.numpy()[np.arange(len(delivered)), self._phase]
         self._phase += 1
         return np.asarray(played, dtype=np.float64)
+
+    @property
+    def belief(self) -> tuple[Tensor, Tensor, Floats]:
+        """Where the controller takes its devices to be, at the step it acted on last.
+
+        Returns:
+            The embeddings [n, D] that the current strides started from, those [n, D] that they
+            lead to, and the share of each stride that is over [n], 0 where one has just started.
+        """
+        return self._starts, self._anchors, (self._phase - 1) / self._planner.stride
 
 
 class LastForce:

@@ -21,15 +21,25 @@ def probe_r2(
         train_z, test_z: embeddings [N, D] and [N', D].
         train_states, test_states: [N, 4] and [N', 4], order :data:`STATE_NAMES`.
     """
-    design = _with_intercept(train_z)
+    truth = test_states.double()
+    residual = truth - read_probe(fit_probe(train_z, train_states), test_z)
+    r2 = 1.0 - residual.square().sum(0) / (truth - truth.mean(0)).square().sum(0)
+    return dict(zip(STATE_NAMES, r2.tolist(), strict=True))
+
+
+def fit_probe(z: Tensor, states: Tensor) -> Tensor:
+    """Linear least squares from embeddings [N, D] to states [N, 4]: weights [D + 1, 4], float64."""
+    design = _with_intercept(z)
     # A tiny ridge keeps collapsed embeddings solvable; 1e-6 of the mean square moves no healthy R².
     gram = design.T @ design
     ridge = 1e-6 * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
-    weights = torch.linalg.solve(gram + ridge, design.T @ train_states.double())
-    truth = test_states.double()
-    residual = truth - _with_intercept(test_z) @ weights
-    r2 = 1.0 - residual.square().sum(0) / (truth - truth.mean(0)).square().sum(0)
-    return dict(zip(STATE_NAMES, r2.tolist(), strict=True))
+    weights: Tensor = torch.linalg.solve(gram + ridge, design.T @ states.double())
+    return weights
+
+
+def read_probe(weights: Tensor, z: Tensor) -> Tensor:
+    """States [N, 4] that a probe reads from embeddings [N, D]."""
+    return _with_intercept(z) @ weights
 
 
 def effective_rank(z: Tensor) -> float:

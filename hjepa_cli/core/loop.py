@@ -189,6 +189,7 @@ def simulate(
     sensor: Sensor,
     *,
     tick: Callable[[], None] = lambda: None,
+    watch: Callable[[int, Floats, Floats], None] = lambda k, states, forces_n: None,
 ) -> Outcome:
     """Run P × N closed loops at once.
 
@@ -199,6 +200,7 @@ def simulate(
         controller: drives P · N devices, point by point; in its initial state.
         sensor: turns states into packets.
         tick: called after every step, for progress.
+        watch: called at every step with k, the states [P · N, 4] and the applied forces [P · N].
 
     Raises:
         NumericalError: the controller returned a force that is not finite.
@@ -220,6 +222,7 @@ def simulate(
         forces = np.clip(forces, -plant.force_limit_n, plant.force_limit_n)
         score += in_band(states)
         cost += stage_cost(states, forces, plant.state_weights, plant.force_weight)
+        watch(k, states, forces)
         previous = states
         poles.step(forces)
         moved = poles.states.reshape(points, devices, 4) + draws.noise[k]

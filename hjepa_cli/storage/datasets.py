@@ -268,8 +268,8 @@ def open_directory(out: Path | None, plant_name: str, root: Path = Path("data"))
         yield directory
 
 
-def find_newest_dataset(root: Path, plant_name: str) -> Path | None:
-    """Return the most recently finished dataset of this plant directly under ``root``, if any."""
+def find_newest_dataset(root: Path, plant_name: str | None = None) -> Path | None:
+    """Return the most recently finished dataset (of a plant) directly under ``root``, if any."""
     found = []
     for name in files.list_names(root):
         with contextlib.suppress(HjepaError, OSError):

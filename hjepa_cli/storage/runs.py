@@ -23,7 +23,7 @@ from typing import IO, Any, Self
 from hjepa_cli import __version__
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
 from hjepa_cli.interrupts import exit_code
-from hjepa_cli.storage import files
+from hjepa_cli.storage import files, tracking
 
 ROOT = Path("runs")
 CONFIG = "config.toml"
@@ -51,6 +51,7 @@ class Run:
         self.result: dict[str, Any] | None = None
         self.resumed = False
         self._lock = lock
+        self._track: tracking.Tracker | None = None
 
     @classmethod
     def create(
@@ -76,7 +77,9 @@ class Run:
             UsageError: ``out`` holds something else, or a run with other settings or input files.
             LockedError: another process works in it.
             StorageError: not writable.
+            MissingInputError: ``HJEPA_LOG`` asks for a package that is not installed.
         """
+        track = tracking.requested()
         if out is None:
             directory = files.next_directory(root / stage)
         else:
@@ -84,6 +87,7 @@ class Run:
             files.make_directory(directory)
             _refuse_foreign(directory, stage)
         run = cls(directory, files.lock_directory(directory))
+        run._track = track(directory) if track else None
         try:
             run._open(stage, settings, inputs or {})
         except BaseException:
@@ -108,6 +112,8 @@ class Run:
         elif columns != list(row):
             raise ValueError(f"metrics.csv has columns {columns}, not {list(row)}")
         self._append(METRICS, _csv_line([_cell(value) for value in row.values()]))
+        if self._track is not None:
+            self._track(row)
 
     @property
     def metrics(self) -> str:

@@ -1,0 +1,257 @@
+"""Animations of closed loops: pictures of all devices, as GIF, as MP4 or in the terminal.
+
+One row per method, one panel per device: the camera's picture of the true cart-pole, over it the
+pole that the controller believes in (dashed, black), the age of its last packet and the SNR, and a
+strip with one column per slot: a full bar is a packet that arrived, a tick one that was lost.
+"""
+
+import contextlib
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from hjepa_cli.core.camera import HEIGHT_PX, PIVOT_ROW_PX, WIDTH_PX, Camera
+from hjepa_cli.core.plant import Plant
+from hjepa_cli.errors import MissingInputError, StorageError, UsageError
+from hjepa_cli.pictures import FAINT, INK, PAPER, font
+from hjepa_cli.storage import files
+
+if TYPE_CHECKING:
+    from hjepa_cli.stages.view import Film, Link
+
+FORMATS = (".gif", ".mp4")
+SCALE = 2  # a frame's pixel is so many of the picture
+PANEL_PX = (WIDTH_PX * SCALE, HEIGHT_PX * SCALE + 16 + 14)  # text above, strip below
+MARGIN_PX, TITLE_PX, HEADER_PX = 8, 18, 34
+LEAST_WIDTH_PX = 520  # for the legend
+ARRIVED, LOST = (0, 158, 115), (213, 94, 0)  # safe for colour-blind readers
+DASH_PX = 7
+COLOURS = 48  # of a GIF
+TERMINAL_COLUMNS, TERMINAL_ROWS = 32, 8  # characters of a panel; two pixels to a character
+
+
+class Pictures:
+    """The pictures of an animation, drawn when asked for.
+
+    Args:
+        films: one per method, of the same devices and steps.
+        link: what the radio did to them.
+        kind: the plant.
+        every: control steps between pictures.
+    """
+
+    def __init__(self, films: "Sequence[Film]", link: "Link", kind: Plant, every: int) -> None:
+        self.films, self.link, self.kind = films, link, kind
+        self.steps = list(range(0, len(link.delivered), every))
+        self._camera = Camera(kind)
+        self.devices = link.delivered.shape[1]
+        width = max(self.devices * (PANEL_PX[0] + MARGIN_PX) + MARGIN_PX, LEAST_WIDTH_PX)
+        height = len(films) * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX
+        self.size_px = (width + width % 2, height + height % 2)  # MP4 wants even sizes
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def __iter__(self) -> Iterator[Image.Image]:
+        return map(self.draw, self.steps)
+
+    def draw(self, k: int) -> Image.Image:
+        """The picture of control step ``k``."""
+        picture = Image.new("RGB", self.size_px, PAPER)
+        draw = ImageDraw.Draw(picture)
+        clock = f"t = {1e3 * k * self.kind.step_s:.0f} ms   {self.link.label}"
+        draw.text((MARGIN_PX, 3), clock, FAINT, font())
+        legend = "dashed: where the controller believes the pole; bar: packet arrived"
+        legend += "; tick: lost" if self.link.sends_always else ""
+        draw.text((MARGIN_PX, 17), legend, FAINT, font())
+        for row, shot in enumerate(self.films):
+            top = HEADER_PX + MARGIN_PX + row * (PANEL_PX[1] + TITLE_PX + MARGIN_PX)
+            score = shot.score[: k + 1].mean()
+            draw.text((MARGIN_PX, top), shot.method, INK, font(13))
+            draw.text((MARGIN_PX + 90, top + 2), f"{score:.0%} of the time inside the band", FAINT,
+                      font())  # fmt: skip
+            for device in range(self.devices):
+                left = MARGIN_PX + device * (PANEL_PX[0] + MARGIN_PX)
+                panel = self._panel(shot, device, k)
+                picture.paste(panel, (left, top + TITLE_PX))
+        return picture
+
+    def age_steps(self, device: int, k: int) -> int:
+        """Steps since the last packet of a device arrived; 0 where one arrives at ``k``."""
+        return k - int(np.flatnonzero(self.link.delivered[: k + 1, device])[-1])
+
+    def frame(self, shot: "Film", device: int, k: int) -> NDArray[np.uint8]:
+        """What the camera sees, uint8 [64, 128, 3]."""
+        (frame,) = self._camera.render(shot.states[k, device][None])
+        return frame
+
+    def caption(self, device: int, k: int) -> str:
+        """Age of the last packet and SNR of this slot."""
+        age_ms = 1e3 * self.age_steps(device, k) * self.kind.step_s
+        snr_db = self.link.snr_db[k, device]
+        return f"packet {age_ms:.0f} ms old   SNR {snr_db:.0f} dB"
+
+    def _panel(self, shot: "Film", device: int, k: int) -> Image.Image:
+        panel = Image.new("RGB", PANEL_PX, PAPER)
+        draw = ImageDraw.Draw(panel)
+        draw.text((0, 1), f"device {device}   {self.caption(device, k)}", INK, font())
+        scene = Image.fromarray(self.frame(shot, device, k))
+        scene = scene.resize((WIDTH_PX * SCALE, HEIGHT_PX * SCALE), Image.Resampling.BOX)
+        self._draw_belief(ImageDraw.Draw(scene), shot.believed[k, device])
+        panel.paste(scene, (0, 16))
+        self._draw_slots(draw, device, k, 16 + HEIGHT_PX * SCALE + 2, PANEL_PX[1] - 1)
+        return panel
+
+    def _draw_belief(self, draw: ImageDraw.ImageDraw, state: NDArray[np.float64]) -> None:
+        """The believed cart as an outline, the believed pole as a dashed line."""
+        scale = self._camera.scale_px_m * SCALE
+        pivot = np.array([WIDTH_PX * SCALE / 2 + state[0] * scale, PIVOT_ROW_PX * SCALE])
+        half = np.array(self.kind.cart_size_m) / 2 * scale
+        draw.rectangle([*(pivot - half), *(pivot + half)], outline=(0, 0, 0))
+        way = 2 * self.kind.half_length_m * scale * np.array([np.sin(state[2]), -np.cos(state[2])])
+        dashes = max(int(np.hypot(*way) / DASH_PX), 1)
+        for dash in range(dashes):  # black shows on the paper, white on the pole
+            ends = (pivot + way * dash / dashes, pivot + way * (dash + 1) / dashes)
+            colour = (0, 0, 0) if dash % 2 == 0 else (255, 255, 255)
+            draw.line([tuple(end) for end in ends], fill=colour, width=3)
+
+    def _draw_slots(
+        self, draw: ImageDraw.ImageDraw, device: int, k: int, top: int, bottom: int
+    ) -> None:
+        """The last slots, one column each, the newest at the right."""
+        draw.rectangle([0, top, PANEL_PX[0] - 1, bottom], fill=(228, 228, 228))
+        first = max(k + 1 - PANEL_PX[0], 0)
+        for slot, arrived in enumerate(self.link.delivered[first : k + 1, device], start=first):
+            column = PANEL_PX[0] - 1 - (k - slot)
+            if arrived:
+                draw.rectangle([column - 1, top, column, bottom], fill=ARRIVED)
+            elif self.link.sends_always:
+                draw.line([(column, bottom - 2), (column, bottom)], fill=LOST)
+
+
+def check_target(path: Path) -> None:
+    """Refuse a file that we could not write, before anything is simulated.
+
+    Raises:
+        UsageError: neither .gif nor .mp4.
+        MissingInputError: MP4 without its library.
+    """
+    if path.suffix not in FORMATS:
+        raise UsageError(f"no animation format '{path.suffix}'; --out FILE.gif or FILE.mp4")
+    if path.suffix == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401 - only whether it is there
+        except ModuleNotFoundError:
+            raise MissingInputError(
+                "MP4 needs imageio-ffmpeg, which is not installed",
+                hint='pip install "hjepa[video]", or --out FILE.gif',
+            ) from None
+
+
+def write(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
+    """Write .gif or .mp4, atomically. Raises StorageError."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        save = _write_gif if path.suffix == ".gif" else _write_mp4
+        save(pictures, temporary, fps, tick)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise files.storage_error(path, error) from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def play(pictures: Pictures, fps: int) -> None:
+    """Show the animation in the terminal, as coloured half blocks."""
+    from rich.live import Live
+
+    with Live(refresh_per_second=fps, transient=False) as live:
+        for k in pictures.steps:
+            started_s = time.monotonic()
+            live.update(terminal_picture(pictures, k))
+            time.sleep(max(0.0, 1 / fps - (time.monotonic() - started_s)))
+
+
+def terminal_picture(pictures: Pictures, k: int) -> Any:
+    """One picture as a rich table: rows of methods, columns of devices."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    for shot in pictures.films:
+        score = shot.score[: k + 1].mean()
+        title = f"{shot.method}, {1e3 * k * pictures.kind.step_s:.0f} ms, {score:.0%} in the band"
+        table.add_row(Text(title, style="bold"))
+        table.add_row(
+            *(_half_blocks(pictures.frame(shot, device, k)) for device in range(pictures.devices))
+        )
+        captions = []
+        for device in range(pictures.devices):
+            arrived = pictures.link.delivered[k, device]
+            lost = pictures.link.sends_always and not arrived
+            mark, style = ("●", "green") if arrived else ("×" if lost else "·", "red")
+            believed = np.degrees(shot.believed[k, device, 2] - shot.states[k, device, 2])
+            caption = Text(f"{mark} ", style=style)
+            caption.append(pictures.caption(device, k), style="default")
+            caption.append(f"\n  θ̃ − θ = {believed:+.1f}°", style="dim")
+            captions.append(caption)
+        table.add_row(*captions)
+    return table
+
+
+def _half_blocks(frame: NDArray[np.uint8]) -> Any:
+    """A frame as text: each character shows two pixels, its colour and its background."""
+    from rich.text import Text
+
+    image = Image.fromarray(frame).crop((0, 16, WIDTH_PX, HEIGHT_PX))
+    size = (TERMINAL_COLUMNS, 2 * TERMINAL_ROWS)
+    pixels = np.asarray(image.resize(size, Image.Resampling.BOX))
+    text = Text()
+    for upper, lower in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True):
+        for above, below in zip(upper, lower, strict=True):
+            text.append("▀", style=f"{_rgb(above)} on {_rgb(below)}")
+        text.append("\n")
+    return text
+
+
+def _rgb(colour: Sequence[int]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def _write_gif(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
+    palette = pictures.draw(pictures.steps[-1]).quantize(COLOURS)  # one for all: no flicker
+    shots = []
+    for picture in pictures:
+        shots.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
+        tick()
+    shots[0].save(
+        path, "GIF", save_all=True, append_images=shots[1:], duration=round(1000 / fps), loop=0
+    )
+
+
+def _write_mp4(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
+    import imageio_ffmpeg
+
+    width, height = pictures.size_px
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps)]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *raw, "-i", "-"]
+    command += ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as encoder:
+        assert encoder.stdin is not None and encoder.stderr is not None
+        with contextlib.suppress(BrokenPipeError):  # it says below why it has gone
+            for picture in pictures:
+                encoder.stdin.write(picture.tobytes())
+                tick()
+            encoder.stdin.close()
+        complaint = encoder.stderr.read().decode(errors="replace")
+    if encoder.returncode:
+        raise StorageError(
+            f"ffmpeg could not write {path.name}: {complaint}", hint="--out FILE.gif"
+        )

@@ -1,0 +1,264 @@
+"""The public Python interface: what the commands do, as functions that return plain objects.
+
+Errors are those of :mod:`hjepa_cli.errors`. Values of settings are given by their dotted names, as
+in a TOML file: ``settings={"protocol.steps": 200}``; ``hjepa config show`` lists them.
+"""
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hjepa_cli.command import resolve
+from hjepa_cli.core.loop import Draws, delivery_schedule, gap_schedule, simulate
+from hjepa_cli.core.methods import build_method
+from hjepa_cli.core.model import Model
+from hjepa_cli.core.plant import plant
+from hjepa_cli.errors import UsageError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import Settings
+from hjepa_cli.storage import datasets, zoo
+
+Values = Mapping[str, Any]
+Floats = NDArray[np.float64]
+
+
+def load_model(name_or_path: str | Path, *, device: str = "cpu") -> Model:
+    """Load a trained model, verified.
+
+    Args:
+        name_or_path: a name of the zoo (``hjepa models list``), a run directory, or a file.
+        device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
+
+    Returns:
+        A model with ``encode(frames)``, ``actor(z)`` and ``planner(method)``.
+
+    Raises:
+        MissingInputError: no such model.
+        DataError: damaged, or an encoder without its hierarchy.
+    """
+    return Model.load(zoo.resolve_model(name_or_path), device)
+
+
+def load_dataset(path: str | Path) -> datasets.Dataset:
+    """Open a dataset directory; ``.split("train")`` reads its trajectories, verified.
+
+    Raises:
+        MissingInputError: no such directory.
+        DataError: not an intact dataset.
+    """
+    return datasets.load_dataset(Path(path))
+
+
+@torch.inference_mode()
+def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tuple[Tensor, Tensor]:
+    """What a controller does when packets stop coming: forces and the embedding it ends at.
+
+    Args:
+        model: of :func:`load_model`.
+        z: the last received embeddings [n, D].
+        steps: control steps, at least 1; they are played in whole strides.
+        method: a predictor that the model holds.
+
+    Returns:
+        Forces in newton [n, steps], and the embeddings [n, D] after the last stride, which is
+        ``steps`` rounded up to a multiple of the stride ahead.
+
+    Raises:
+        UsageError: no such predictor, or no step.
+    """
+    if steps < 1:
+        raise UsageError(f"steps = {steps}; expected at least 1")
+    planner = model.planner(method)
+    z = z.to(model.device)
+    forces_n = []
+    for _ in range(-(-steps // planner.stride)):
+        played, z = planner.plan(z)
+        forces_n.append(played.float())
+    return torch.cat(forces_n, dim=1)[:, :steps].cpu(), z.float().cpu()
+
+
+def drive(
+    method: str,
+    *,
+    model: Model | None = None,
+    gap_steps: float | None = None,
+    delivery: float | None = None,
+    devices: int = 4,
+    preset: str | None = None,
+    settings: Values | None = None,
+) -> dict[str, Floats]:
+    """Drive some devices in closed loop over one link and return what happened.
+
+    Args:
+        method: as on the command line; those on embeddings need ``model``.
+        model: of :func:`load_model`.
+        gap_steps: a packet every so many steps; or
+        delivery: a packet at every step that arrives with this probability. Neither: all arrive.
+        devices: n.
+        preset, settings: plant, seed and protocol (its steps K).
+
+    Returns:
+        ``states`` [K, n, 4], ``forces_n`` [K, n], ``score`` [n] (share of steps inside the
+        band), ``cost`` [n] (mean capped quadratic cost).
+
+    Raises:
+        UsageError: unknown method, or both kinds of link.
+    """
+    if gap_steps is not None and delivery is not None:
+        raise UsageError("give gap_steps or delivery, not both")
+    chosen = _settings(preset, None, settings)
+    draws = Draws.make(chosen.protocol, devices, chosen.seed)
+    if delivery is not None:
+        schedule = delivery_schedule(delivery, draws.delivery)
+    else:
+        schedule = gap_schedule(gap_steps or 1, draws.steps, devices)
+    how = build_method(method, chosen, model)
+    states: list[Floats] = []
+    forces: list[Floats] = []
+
+    def watch(k: int, now: Floats, forces_n: Floats) -> None:
+        states.append(now.copy())
+        forces.append(forces_n.copy())
+
+    outcome = simulate(
+        plant(chosen.plant),
+        draws,
+        (schedule if how.uses_link else np.ones_like(schedule))[None],
+        how.controller(devices),
+        how.sensor,
+        watch=watch,
+    )
+    return {
+        "states": np.stack(states),
+        "forces_n": np.stack(forces),
+        "score": outcome.score[0],
+        "cost": outcome.cost[0],
+    }
+
+
+def collect(
+    *,
+    out: str | Path | None = None,
+    preset: str | None = None,
+    config: str | Path | None = None,
+    settings: Values | None = None,
+) -> datasets.Dataset:
+    """Simulate trajectories and store them, as ``hjepa collect``; returns the dataset."""
+    from hjepa_cli.stages.collect import run
+
+    made = run(_settings(preset, config, settings), _silent(), out=_path(out))
+    return load_dataset(made["dataset"])
+
+
+def train_encoder(
+    *,
+    dataset: str | Path | None = None,
+    out: str | Path | None = None,
+    preset: str | None = None,
+    config: str | Path | None = None,
+    settings: Values | None = None,
+) -> dict[str, Any]:
+    """Learn an encoder, as ``hjepa train-encoder``; returns the document of ``--json``."""
+    from hjepa_cli.stages.train_encoder import run
+
+    return run(
+        _settings(preset, config, settings), _silent(), dataset=_path(dataset), out=_path(out)
+    )
+
+
+def train_hierarchy(
+    *,
+    dataset: str | Path | None = None,
+    encoder: str | Path | None = None,
+    out: str | Path | None = None,
+    preset: str | None = None,
+    config: str | Path | None = None,
+    settings: Values | None = None,
+) -> dict[str, Any]:
+    """Train predictors and actor, as ``hjepa train-hierarchy``; returns the ``--json`` document."""
+    from hjepa_cli.stages.train_hierarchy import run
+
+    return run(
+        _settings(preset, config, settings),
+        _silent(),
+        dataset=_path(dataset),
+        encoder=None if encoder is None else str(encoder),
+        out=_path(out),
+    )
+
+
+def evaluate(
+    *,
+    checkpoint: str | Path | None = None,
+    methods: Sequence[str] | None = None,
+    out: str | Path | None = None,
+    remeasure: bool = False,
+    preset: str | None = None,
+    config: str | Path | None = None,
+    settings: Values | None = None,
+) -> dict[str, Any]:
+    """Measure methods in closed loop, as ``hjepa eval``; returns the document of ``--json``."""
+    from hjepa_cli.stages.evaluate import run
+
+    return _measure(run, checkpoint, methods, out, remeasure, preset, config, settings)
+
+
+def scale(
+    *,
+    snr: str | None = None,
+    law: str | None = None,
+    checkpoint: str | Path | None = None,
+    methods: Sequence[str] | None = None,
+    out: str | Path | None = None,
+    remeasure: bool = False,
+    preset: str | None = None,
+    config: str | Path | None = None,
+    settings: Values | None = None,
+) -> dict[str, Any]:
+    """Count the devices of a cell, as ``hjepa scale``; returns the document of ``--json``."""
+    from hjepa_cli.stages.scale import run
+
+    radio = {"radio.snr_db": snr, "radio.law": law}
+    values = dict(settings or {}) | {key: value for key, value in radio.items() if value}
+    return _measure(run, checkpoint, methods, out, remeasure, preset, config, values)
+
+
+def _measure(
+    run: Callable[..., dict[str, Any]],
+    checkpoint: str | Path | None,
+    methods: Sequence[str] | None,
+    out: str | Path | None,
+    remeasure: bool,
+    preset: str | None,
+    config: str | Path | None,
+    settings: Values | None,
+) -> dict[str, Any]:
+    values = dict(settings or {})
+    if methods is not None:
+        values["methods"] = list(methods)
+    return run(
+        _settings(preset, config, values),
+        _silent(),
+        checkpoint=None if checkpoint is None else str(checkpoint),
+        out=_path(out),
+        remeasure=remeasure,
+    )
+
+
+def _settings(preset: str | None, config: str | Path | None, values: Values | None) -> Settings:
+    return resolve(preset, _path(config), {"plant": None, **(values or {})})
+
+
+def _path(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path)
+
+
+def _silent() -> Screen:
+    """No notes, no progress, no tables: results are returned."""
+    return Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())

@@ -1,0 +1,69 @@
+"""``hjepa config show``: every value that a command would use, and where it comes from."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hjepa_cli.errors import UsageError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import Settings, origins
+from hjepa_cli.storage.runs import to_toml
+
+Result = dict[str, Any]
+
+
+def show(
+    screen: Screen,
+    settings: Settings,
+    *,
+    config: Path | None,
+    flags: Mapping[str, Any],
+    key: str = "",
+    as_toml: bool = False,
+) -> Result:
+    """Print the settings with their origins; returns the document of ``--json``.
+
+    Args:
+        screen: where to.
+        settings: the resolved settings.
+        config, flags: what they were resolved from, besides their preset.
+        key: only this section or value.
+        as_toml: print a complete TOML file instead of a table.
+
+    Raises:
+        UsageError: no such section or value.
+    """
+    sources = origins(settings.preset, config, flags)
+    values = flat(settings.as_dict())
+    shown = [name for name in sources if not key or name == key or name.startswith(f"{key}.")]
+    if not shown:
+        sections = sorted({name.split(".")[0] for name in sources})
+        raise UsageError(f"no setting or section '{key}'; choose from {', '.join(sections)}")
+    if as_toml:
+        for line in to_toml(settings.as_dict()).splitlines():
+            screen.result(line)
+    else:
+        screen.table(
+            f"settings of preset {settings.preset}",
+            ["setting", "value", "from"],
+            [[name, text(values[name]), sources[name]] for name in shown],
+        )
+    return {
+        "preset": settings.preset,
+        "values": {name: {"value": values[name], "from": sources[name]} for name in shown},
+    }
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted key."""
+    pairs: dict[str, Any] = {}
+    for name, value in values.items():
+        pairs |= flat(value, f"{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return pairs
+
+
+def text(value: Any) -> str:
+    """One value as TOML writes it, without quotes."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(text, value))}]"
+    return str(value).lower() if isinstance(value, bool) else str(value)

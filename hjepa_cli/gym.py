@@ -1,0 +1,205 @@
+"""The cart-poles as Gymnasium environments, for other people's agents (extra ``gym``).
+
+Importing this module registers ``hjepa/CartPole-v0`` (the agent sees the state) and
+``hjepa/CartPolePixels-v0`` (it sees the camera). Starts, process noise and length are those of the
+closed-loop protocol of ``hjepa eval``; only here an episode ends when the pole has fallen or the
+cart has left the picture, because agents learn little from a pole on the floor.
+"""
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+try:
+    import gymnasium
+except ModuleNotFoundError as missing:
+    raise ModuleNotFoundError(
+        'hjepa_cli.gym needs gymnasium: pip install "hjepa[gym]"', name=missing.name
+    ) from None
+from gymnasium import spaces
+
+from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
+from hjepa_cli.core.loop import STATE_LIMIT, noise_per_step
+from hjepa_cli.core.metrics import COST_CAP, in_band, stage_cost
+from hjepa_cli.core.plant import CartPole
+from hjepa_cli.core.seeding import generator
+from hjepa_cli.errors import UsageError
+from hjepa_cli.settings import load_settings
+
+Observation = NDArray[Any]
+REWARDS = ("lq", "score")
+LOSSES = 0x1055  # this stream's branch of the seed tree
+
+
+class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """One cart-pole; the observation is its state (x, x_dot, theta, theta_dot) in SI units.
+
+    The action [1] in -1 … 1 is the force ÷ 20 N. ``info`` has ``state`` and ``score``, the share
+    of control steps of this action inside the band |x| ≤ 0.05 m, |theta| ≤ 0.05 rad.
+
+    Args:
+        plant: ``"desktop"`` (1 ms control steps, 1,000 of them) or ``"gym"`` (20 ms, 300).
+        reward: ``"lq"``: 1 - min(xᵀQx + Ru², 50) ÷ 50 with the teacher's Q and R; ``"score"``: 1
+            inside the band, else 0. Both are means over the control steps of the action.
+        action_repeat: control steps that each action is held for.
+        noise: process noise as in the protocol, or none.
+        render_mode: ``"rgb_array"`` or ``None``.
+
+    Raises:
+        UsageError: unknown plant or reward, or no step at all.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
+
+    def __init__(
+        self,
+        *,
+        plant: str = "desktop",
+        reward: str = "lq",
+        action_repeat: int = 1,
+        noise: bool = True,
+        render_mode: str | None = None,
+    ) -> None:
+        if reward not in REWARDS:
+            raise UsageError(f"unknown reward '{reward}'; choose one of {', '.join(REWARDS)}")
+        if action_repeat < 1:
+            raise UsageError(f"action_repeat = {action_repeat}; expected at least 1")
+        self._pole = CartPole(plant)
+        self._kind = self._pole.plant
+        self._protocol = load_settings("gym" if plant == "gym" else None).protocol
+        self._camera = Camera(self._kind)
+        self._reward, self._repeat = reward, action_repeat
+        self._noise = noise_per_step(self._protocol) * noise
+        self._k = 0
+        self.render_mode = render_mode
+        self.metadata = type(self).metadata | {
+            "render_fps": max(round(1 / (self._kind.step_s * action_repeat)), 1)
+        }
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space: spaces.Space[Any] = spaces.Box(
+            -STATE_LIMIT, STATE_LIMIT, (4,), np.float32
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start anywhere in the protocol's range of initial states."""
+        super().reset(seed=seed)
+        protocol = self._protocol
+        half_widths = np.array(
+            [protocol.x_m, protocol.x_dot_m_s, protocol.theta_rad, protocol.theta_dot_rad_s]
+        )
+        # A new simulation: what pymunk remembers of the last episode would move the last bits.
+        self._pole = CartPole(self._kind)
+        self._pole.state = self.np_random.uniform(-1, 1, 4) * half_widths
+        self._k = 0
+        return self._observe(), self._info(float(in_band(self._pole.state)))
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Apply a force, ``action_repeat`` control steps long."""
+        kind, limit_n = self._kind, self._kind.force_limit_n
+        force_n = float(np.clip(np.asarray(action, float).reshape(-1)[0], -1, 1)) * limit_n
+        score = cost = 0.0
+        steps = min(self._repeat, self._protocol.steps - self._k) or 1
+        for _ in range(steps):
+            state = self._pole.state
+            score += float(in_band(state))
+            cost += float(stage_cost(state, np.float64(force_n), kind.state_weights,
+                                     kind.force_weight))  # fmt: skip
+            self._pole.step(force_n)
+            moved = self._pole.state + self.np_random.standard_normal(4) * self._noise
+            self._pole.state = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
+        self._k += steps
+        x_m, _, theta_rad, _ = self._pole.state
+        fallen = abs(theta_rad) > math.pi / 2 or abs(x_m) > kind.window_m[0] / 2
+        reward = score / steps if self._reward == "score" else 1 - cost / steps / COST_CAP
+        over = self._k >= self._protocol.steps
+        return self._observe(), reward, bool(fallen), bool(over), self._info(score / steps)
+
+    def render(self) -> Any:
+        """The camera's frame uint8 [64, 128, 3], in render mode ``rgb_array``."""
+        return self._frame() if self.render_mode == "rgb_array" else None
+
+    def _observe(self) -> Observation:
+        return self._pole.state.astype(np.float32)
+
+    def _frame(self) -> NDArray[np.uint8]:
+        (frame,) = self._camera.render(self._pole.state[None])
+        return frame
+
+    def _info(self, score: float) -> dict[str, Any]:
+        return {"state": self._pole.state, "score": score}
+
+
+class CartPolePixelsEnv(CartPoleEnv):
+    """The same cart-pole seen by the camera: frames uint8 [64, 128, 3].
+
+    One frame shows no velocity. ``gymnasium.wrappers.FrameStackObservation(env, 2)`` gives pairs
+    uint8 [2, 64, 128, 3] (previous, current), which is what a model's encoder takes.
+
+    Args:
+        **options: those of :class:`CartPoleEnv`.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.observation_space = spaces.Box(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+
+    def _observe(self) -> Observation:
+        return self._frame()
+
+
+class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An uplink that loses observations: the agent then sees the last one that got through.
+
+    The first observation of an episode always arrives. ``info`` has ``delivered`` and
+    ``age_steps``, the actions since the observation was taken.
+
+    Args:
+        env: any environment.
+        delivery_probability: p, of each observation, independently. For a Rayleigh-fading link,
+            1 - ``hjepa_cli.core.channel.outage_probability(rate_bps, bandwidth_hz, snr_db)``.
+
+    Raises:
+        UsageError: p outside 0 … 1.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], delivery_probability: float) -> None:
+        super().__init__(env)
+        if not 0 <= delivery_probability <= 1:
+            raise UsageError(
+                f"delivery_probability = {delivery_probability}; expected between 0 and 1"
+            )
+        self.delivery_probability = delivery_probability
+        self._received: Any = None
+        self._age = 0
+        self._random = np.random.default_rng()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; a seed also fixes which observations get lost."""
+        if seed is not None:  # a stream of its own: losses do not change the plant's noise
+            self._random = generator(seed, LOSSES)
+        observation, info = super().reset(seed=seed, options=options)
+        self._received, self._age = observation, 0
+        return observation, info | {"delivered": True, "age_steps": 0}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Act; what is seen of it may be old."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        delivered = bool(self._random.random() < self.delivery_probability)
+        if delivered:
+            self._received, self._age = observation, 0
+        else:
+            self._age += 1
+        info = info | {"delivered": delivered, "age_steps": self._age}
+        return self._received, reward, terminated, truncated, info
+
+
+gymnasium.register("hjepa/CartPole-v0", entry_point=CartPoleEnv)
+gymnasium.register("hjepa/CartPolePixels-v0", entry_point=CartPolePixelsEnv)

@@ -1,0 +1,268 @@
+"""``hjepa view``: watch closed loops over a fading link, and what the controller believes.
+
+Model → a few devices per method on the same draws and the same fading → an animation: the true
+pole, the pole that a linear probe reads from the controller's current embedding, every packet, the
+SNR and the age of the last packet. It shows a handful of devices; numbers come from ``eval``.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hjepa_cli.core import health
+from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.capacity import equal_devices
+from hjepa_cli.core.channel import rayleigh_power_gains
+from hjepa_cli.core.controllers import StrideController
+from hjepa_cli.core.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
+from hjepa_cli.core.methods import embedding_method
+from hjepa_cli.core.metrics import in_band
+from hjepa_cli.core.model import Model
+from hjepa_cli.core.plant import Plant, plant
+from hjepa_cli.core.seeding import generator
+from hjepa_cli.core.trajectories import generate
+from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import Settings
+from hjepa_cli.stages.evaluate import open_subject
+
+FADING_KEY = 0xFAD1
+PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encoded in seconds
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """What the radio does to n devices over K steps.
+
+    Attributes:
+        delivered: which packets arrive [K, n].
+        snr_db: received SNR in each slot [K, n].
+        sends_always: a packet in every slot, so that one that does not arrive was lost.
+        label: one line for people.
+    """
+
+    delivered: Bools
+    snr_db: Floats
+    sends_always: bool
+    label: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """What happened to the devices of one method.
+
+    Attributes:
+        method: its name.
+        states: true states [K, n, 4].
+        believed: states read from the controller's embedding [K, n, 4].
+        score: whether each step was inside the band [K, n].
+    """
+
+    method: str
+    states: Floats
+    believed: Floats
+    score: Bools
+
+
+class Believer:
+    """A controller whose belief is read at every step.
+
+    Args:
+        controller: drives n devices from embeddings.
+        probe: of :func:`hjepa_cli.core.health.fit_probe`.
+    """
+
+    def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
+        self._controller, self._probe = controller, probe
+        self._last: torch.Tensor | None = None
+        self.believed: list[Floats] = []
+
+    def act(self, delivered: Bools, packets: Any) -> Floats:
+        """Forces of one step [n]."""
+        forces_n = self._controller.act(delivered, packets)
+        if isinstance(self._controller, StrideController):
+            start, end, share = self._controller.belief
+            states = self._read(start)
+            states += share[:, None] * (self._read(end) - states)
+        else:  # no prediction: what it received last
+            if packets is not None:
+                if self._last is None:
+                    self._last = packets.clone()
+                self._last[torch.from_numpy(delivered)] = packets
+            assert self._last is not None, "the first packets always arrive"
+            states = self._read(self._last)
+        self.believed.append(states)
+        return forces_n
+
+    def _read(self, z: torch.Tensor) -> Floats:
+        return np.asarray(health.read_probe(self._probe, z.cpu()).numpy())
+
+
+def run(
+    settings: Settings,
+    screen: Screen,
+    *,
+    checkpoint: str | None = None,
+    out: Path = Path("hjepa-view.gif"),
+    devices: int = 3,
+    snr_db: float = 20.0,
+    delivery: float = 0.05,
+    gap_steps: float | None = None,
+    every: int | None = None,
+    fps: int = 20,
+    live: bool = False,
+) -> dict[str, Any]:
+    """Simulate, then draw a GIF or MP4, or play in the terminal; returns the ``--json`` document.
+
+    Args:
+        settings: plant, seed, methods, protocol and bandwidth.
+        screen: where to say so.
+        checkpoint: zoo name, run directory or file; default: the newest run, else the zoo.
+        out: ``.gif`` or ``.mp4``.
+        devices: side by side.
+        snr_db: mean SNR of the fading link.
+        delivery: share of packets that arrive.
+        gap_steps: instead of fading, one packet every so many steps.
+        every: control steps between pictures; default: a hundred pictures in all.
+        fps: pictures per second.
+        live: play in the terminal instead of writing a file.
+
+    Raises:
+        UsageError: a method that predicts no embedding, a format we do not write, no terminal.
+        MissingInputError: no model, or a library is missing.
+    """
+    try:
+        from hjepa_cli import animation
+    except ModuleNotFoundError as missing:
+        if missing.name != "PIL":
+            raise
+        raise MissingInputError(
+            "a view needs Pillow, which is not installed", hint='pip install "hjepa[plot]"'
+        ) from None
+    if not live:
+        animation.check_target(out)
+    elif not screen.is_terminal:
+        raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
+    subject = open_subject(settings, screen, checkpoint, None)
+    if subject.model is None:
+        raise MissingInputError(f"no model of plant {settings.plant}", hint="hjepa train-hierarchy")
+    check_methods(settings.methods, subject.model)
+
+    link = make_link(settings, subject.model, devices, snr_db, delivery, gap_steps)
+    screen.say(link.label)
+    probe = fit_probe(settings, subject.model, screen)
+    films = [film(name, settings, subject.model, link, probe, screen) for name in settings.methods]
+    every = every or max(settings.protocol.steps // 100, 1)
+    pictures = animation.Pictures(films, link, plant(settings.plant), every)
+    result = {
+        "checkpoint": subject.path,
+        "methods": {
+            shot.method: {
+                "share_in_band": shot.score.mean(axis=0),
+                "belief_error_x_m": np.abs(shot.believed - shot.states)[..., 0].mean(),
+                "belief_error_theta_rad": np.abs(shot.believed - shot.states)[..., 2].mean(),
+            }
+            for shot in films
+        },
+        "delivered": link.delivered.mean(),
+        "pictures": len(pictures),
+        "file": None if live else out,
+    }
+    if live:
+        animation.play(pictures, fps)
+        return result
+    with screen.progress("draw", len(pictures), "pictures") as bar:
+        animation.write(pictures, out, fps, bar.advance)
+    screen.say(f"{len(pictures)} pictures at {fps} per second: {out}")
+    return result
+
+
+def check_methods(methods: Sequence[str], model: Model) -> None:
+    """Only methods on embeddings believe in something that can be shown."""
+    for name in methods:
+        if name not in model.methods:
+            raise UsageError(
+                f"method '{name}' cannot be viewed with this model; "
+                f"choose from {', '.join(model.methods)}"
+            )
+
+
+def make_link(
+    settings: Settings,
+    model: Model,
+    devices: int,
+    snr_db: float,
+    delivery: float,
+    gap_steps: float | None,
+) -> Link:
+    """Rayleigh block fading with a delivery probability, or periodic packets.
+
+    A packet arrives where the gain |h|² reaches -ln p: then it does with probability p. That is
+    the law ``equal`` for as many devices as bring p about.
+    """
+    steps, kind = settings.protocol.steps, plant(settings.plant)
+    if gap_steps is not None:
+        schedule = gap_schedule(gap_steps, steps, devices)
+        label = f"a packet every {gap_steps:g} steps, SNR {snr_db:g} dB by power control"
+        return Link(schedule, np.full((steps, devices), snr_db), False, label)
+    gains = np.stack(
+        [
+            rayleigh_power_gains(generator(settings.seed, FADING_KEY, device), steps)
+            for device in range(devices)
+        ],
+        axis=1,
+    )
+    delivered = gains >= -np.log(delivery)
+    delivered[0] = True
+    bits = embedding_method(
+        "hold", model, settings.protocol.payload_bits_per_value
+    ).bits_per_transmission
+    sharing = equal_devices(delivery, bits, settings.radio.bandwidth_hz, kind.step_s, snr_db)
+    label = (
+        f"Rayleigh fading, mean SNR {snr_db:g} dB, packets arrive with p = {delivery:g}: "
+        f"{sharing} devices share {settings.radio.bandwidth_hz / 1e6:g} MHz"
+    )
+    return Link(delivered, snr_db + 10 * np.log10(gains), True, label)
+
+
+def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
+    """A linear probe from embeddings to states, on training trajectories made from the seed."""
+    count = min(PROBE_TRAJECTORIES, settings.collect.trajectories)
+    recorded = generate(settings, "train")[:count]
+    camera = Camera(settings.plant)
+    embeddings, states = [], []
+    with screen.progress("fit probe", count, "trajectories") as bar:
+        for trajectory in recorded.states:
+            now = np.arange(1, len(trajectory), PROBE_EVERY)
+            pairs = trajectory[np.stack([now - 1, now], axis=1)]
+            frames = camera.render(pairs.reshape(-1, 4))
+            embeddings.append(model.encode(frames.reshape(-1, 2, *frames.shape[1:])))
+            states.append(torch.from_numpy(trajectory[now]))
+            bar.advance()
+    return health.fit_probe(torch.cat(embeddings), torch.cat(states))
+
+
+def film(
+    name: str, settings: Settings, model: Model, link: Link, probe: torch.Tensor, screen: Screen
+) -> Film:
+    """Drive the devices with one method and keep every state and belief."""
+    kind: Plant = plant(settings.plant)
+    method = embedding_method(name, model, settings.protocol.payload_bits_per_value)
+    steps, devices = link.delivered.shape
+    believer = Believer(method.controller(devices), probe)
+    states: list[Floats] = []
+    with screen.progress(f"simulate {name}", steps, "steps") as bar:
+        simulate(
+            kind,
+            Draws.make(settings.protocol, devices, settings.seed),
+            link.delivered[None],
+            believer,
+            method.sensor,
+            tick=bar.advance,
+            watch=lambda k, now, forces_n: states.append(now.copy()),
+        )
+    return Film(name, np.stack(states), np.stack(believer.believed), in_band(np.stack(states)))

@@ -1,0 +1,261 @@
+"""Commands beside the pipeline: reports, pictures, datasets and settings.
+
+As in :mod:`hjepa_cli.cli`, nothing heavy is imported before a command runs.
+"""
+
+from pathlib import Path
+
+import typer
+
+from hjepa_cli import options, plan
+from hjepa_cli.command import Result, execute, print_help, resolve
+from hjepa_cli.plan import Plan
+from hjepa_cli.screen import Screen
+
+data_app = typer.Typer(help="Describe, verify, look at and export datasets.")
+config_app = typer.Typer(help="Show settings.")
+
+
+@data_app.callback(invoke_without_command=True)
+def data(context: typer.Context) -> None:
+    print_help(context)
+
+
+@data_app.command("info")
+def data_info(
+    dataset: options.DatasetPath = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Describe a dataset: plant, seed, splits, size, sha256."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.data import show_info
+
+        return show_info(screen, dataset)
+
+    execute(screen, stage)
+
+
+@data_app.command("verify")
+def data_verify(
+    datasets: options.DatasetPaths = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Read every shard and check it against its sha256; without a name, all of data/."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.data import verify
+
+        return verify(screen, datasets or [])
+
+    execute(screen, stage)
+
+
+@data_app.command("preview")
+def data_preview(
+    dataset: options.DatasetPath = None,
+    split: options.Split = "train",
+    rows: options.SheetRows = 6,
+    columns: options.SheetColumns = 8,
+    out: options.FileOut = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Draw a contact sheet of camera frames (PNG)."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.data import preview
+
+        return preview(screen, dataset, out, split, rows, columns)
+
+    execute(screen, stage, product="picture")
+
+
+@data_app.command("export")
+def data_export(
+    dataset: options.DatasetPath = None,
+    split: options.Split = "train",
+    format: options.ExportFormat = None,
+    pixels: options.Pixels = True,
+    out: options.FileOut = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Write one split for other programs: HDF5 in stable-worldmodel's layout, or NPZ."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.data import export
+
+        return export(screen, dataset, out, split, format, pixels)
+
+    def planned() -> Plan:
+        from hjepa_cli.data import plan_export
+
+        return plan_export(dataset, out, split, format, pixels)
+
+    execute(screen, stage, planned, dry_run=dry_run, product="file")
+
+
+@config_app.callback(invoke_without_command=True)
+def config_group(context: typer.Context) -> None:
+    print_help(context)
+
+
+@config_app.command("show")
+def config_show(
+    key: options.SettingPrefix = "",
+    toml: options.Toml = False,
+    methods: options.Methods = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Print every setting that a command would use, and where it comes from."""
+    flags = {
+        "plant": plant,
+        "seed": seed,
+        "device": device,
+        "methods": options.split_names(methods),
+    }
+    settings = resolve(preset, config, flags)
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.configuration import show
+
+        return show(screen, settings, config=config, flags=flags, key=key, as_toml=toml)
+
+    execute(screen, stage)
+
+
+def view(
+    methods: options.ViewMethods = "hjepa,hold",
+    devices: options.ViewDevices = 3,
+    snr: options.ViewSnr = 20.0,
+    delivery: options.Delivery = 0.05,
+    gap: options.Gap = None,
+    every: options.Every = None,
+    fps: options.Fps = 20,
+    live: options.Live = False,
+    bandwidth_mhz: options.BandwidthMhz = None,
+    checkpoint: options.Checkpoint = None,
+    out: options.AnimationOut = Path("hjepa-view.gif"),
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Watch closed loops over a fading link: true pole, believed pole, packets, SNR, age."""
+    settings = resolve(
+        preset,
+        config,
+        {
+            "plant": plant,
+            "seed": seed,
+            "device": device,
+            "methods": options.split_names(methods),
+            "radio.bandwidth_hz": None if bandwidth_mhz is None else bandwidth_mhz * 1e6,
+        },
+    )
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.view import run
+
+        return run(
+            settings,
+            screen,
+            checkpoint=checkpoint,
+            out=out,
+            devices=devices,
+            snr_db=snr,
+            delivery=delivery,
+            gap_steps=gap,
+            every=every,
+            fps=fps,
+            live=live,
+        )
+
+    def planned() -> Plan:
+        return plan.plan_view(settings, checkpoint, out, devices, live=live)
+
+    execute(screen, stage, planned, dry_run=dry_run, product=None if live else "file")
+
+
+def report(
+    runs: options.RunPaths = None,
+    out: options.ReportOut = Path("report.html"),
+    figures: options.FigureDirectory = None,
+    format: options.FigureFormats = "pdf",
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Write what runs found as one HTML file: figures, tables, settings, commands."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.report import run
+
+        formats = options.split_names(format) or []
+        return run(screen, runs or [], out=out, figures=figures, formats=formats)
+
+    execute(screen, stage, product="report")
+
+
+def reproduce(
+    methods: options.Methods = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Run all stages into one folder and write the report."""
+    flags = {
+        "plant": plant,
+        "seed": seed,
+        "device": device,
+        "methods": options.split_names(methods),
+    }
+    settings = resolve(preset, config, flags)
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.reproduce import run
+
+        return run(settings, screen, out=out)
+
+    execute(
+        screen,
+        stage,
+        lambda: plan.plan_reproduce(settings, out),
+        dry_run=dry_run,
+        product="report",
+    )

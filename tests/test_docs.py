@@ -1,0 +1,104 @@
+"""The documentation: every command parses, every example runs, the reference is the program's."""
+
+import doctest
+import importlib.machinery
+import importlib.util
+import re
+import shlex
+import warnings
+from pathlib import Path
+
+import pytest
+from command_line import ROOT, open_shell
+
+from hjepa_cli.storage.zoo import list_models
+
+PAGES = ("README.md", "CONTRIBUTING.md", *sorted(f"docs/{p.name}" for p in ROOT.glob("docs/*.md")))
+NOT_RUN = re.compile(r"<!-- not run: [^>]+ -->\s*```\w*\n.*?```", re.DOTALL)
+WITH_PLAN = ("collect", "train-encoder", "train-hierarchy", "eval", "scale", "view", "reproduce")
+PLACEHOLDER = re.compile(r"[A-Z]{3,}|…|\.\.\.|[<>\[\]|]|\{")
+
+
+def test_the_reference_of_the_command_line_is_current():
+    """Otherwise: scripts/cli_reference > docs/cli.md"""
+    loader = importlib.machinery.SourceFileLoader("reference", str(ROOT / "scripts/cli_reference"))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("reference", loader))
+    loader.exec_module(module)
+    assert (ROOT / "docs/cli.md").read_text() == module.reference()
+
+
+def text_of(page):
+    return NOT_RUN.sub("", (ROOT / page).read_text())
+
+
+def commands():
+    """All commands of the documentation, from indented and fenced blocks and from running text."""
+    found = {}
+    for page in PAGES:
+        if page in ("docs/cli.md", "docs/LOG.md"):  # headings; commands of their day
+            continue
+        text = text_of(page)
+        lines = re.findall(r"^ {4}(?:\.venv/bin/)?(hjepa [^\n#]*)", text, re.MULTILINE)
+        lines += re.findall(r"`(hjepa [^`\n]+)`", text)
+        for line in lines:
+            changes_the_shell = line.startswith("hjepa --")
+            if not PLACEHOLDER.search(line) and not changes_the_shell:
+                found.setdefault(line.strip(), page)
+    return sorted(found.items())
+
+
+@pytest.mark.parametrize(("line", "page"), commands(), ids=str)
+def test_every_command_of_the_documentation_is_understood(
+    tmp_path, monkeypatch, capsys, line, page
+):
+    """Run with --dry-run, or for real where that takes no time."""
+    shell = open_shell(tmp_path, monkeypatch, capsys)
+    _, *words = shlex.split(line)
+    missing = [w for w in words if re.fullmatch(r"(desktop|gym)-h\d+m\d+l\d+", w)]
+    if set(missing) - set(list_models()):
+        pytest.skip("the zoo lacks this model")
+    if words[0] in WITH_PLAN:
+        outcome = shell(*words, *([] if "--dry-run" in words else ["--dry-run"]))
+        allowed = (0, 66)  # an example may name a file of the reader's
+    elif words[:2] == ["config", "show"] or words == ["models", "list"]:
+        outcome, allowed = shell(*words), (0,)
+    else:
+        outcome, allowed = shell(*words, "--quiet"), (0, 66)
+    assert outcome.code in allowed, (page, outcome)
+
+
+def blocks():
+    """Python blocks by page; ``>>>`` sessions of a page are one, other blocks stand alone."""
+    for page in PAGES:
+        code = re.findall(r"```python\n(.*?)```", text_of(page), re.DOTALL)
+        if any(block.startswith(">>>") for block in code):
+            yield page, "".join(block for block in code if block.startswith(">>>"))
+        for block in code:
+            if not block.startswith(">>>") and "stable_baselines3" not in block:
+                yield page, block
+
+
+@pytest.mark.parametrize(("page", "code"), list(blocks()), ids=lambda v: v if v in PAGES else "")
+def test_every_python_block_runs(tmp_path, monkeypatch, page, code):
+    if page == "docs/python.md":
+        pytest.skip("test_api.py runs it")
+    if "hjepa_cli.gym" in code:
+        pytest.importorskip("gymnasium")
+    if "desktop-h4m2l1" in code and "desktop-h4m2l1" not in list_models():
+        pytest.skip("the zoo lacks this model")
+    monkeypatch.chdir(tmp_path)
+    if code.startswith(">>>"):
+        example = doctest.DocTestParser().get_doctest(code, {}, page, page, 0)
+        runner = doctest.DocTestRunner()
+        runner.run(example)
+        assert runner.tries > 0 and runner.failures == 0
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        exec(compile(code, page, "exec"), {"__name__": "example"})
+
+
+def test_links_between_pages_lead_somewhere():
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", (ROOT / page).read_text()):
+            assert (Path(ROOT / page).parent / target).exists(), (page, target)

@@ -1,0 +1,113 @@
+"""``hjepa reproduce``: each stage reads what the one before it left in the folder, nothing else."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import assert_one_line_error, open_shell
+
+from hjepa_cli.errors import NumericalError
+from hjepa_cli.stages import (
+    collect,
+    evaluate,
+    report,
+    reproduce,
+    scale,
+    train_encoder,
+    train_hierarchy,
+)
+
+ORDER = ["collect", "train-encoder", "train-hierarchy", "eval", "scale"]
+MODULES = (collect, train_encoder, train_hierarchy, evaluate, scale)
+
+
+@pytest.fixture
+def shell(tmp_path, monkeypatch, capsys):
+    return open_shell(tmp_path, monkeypatch, capsys)
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Stages that only remember how they were called."""
+    made = []
+
+    def install(name, module):
+        def run(settings, screen, **inputs):
+            made.append((name, inputs))
+            if failing == [name]:
+                raise NumericalError("the encoder failed its gate", hint="h")
+            return {"stage": name}
+
+        monkeypatch.setattr(module, "run", run)
+
+    failing = []
+    for name, module in zip(ORDER, MODULES, strict=True):
+        install(name, module)
+    monkeypatch.setattr(
+        report, "run", lambda screen, paths, *, out, figures: {"report": out, "paths": paths}
+    )
+    made.append(failing)
+    return made
+
+
+def test_the_stages_run_in_order_on_each_others_results(shell, calls):
+    document = shell("reproduce", "--preset", "smoke", "--out", "f", "--json").document
+    _, *made = calls
+    assert [name for name, _ in made] == ORDER
+    inputs = dict(made)
+    assert inputs["collect"]["out"] == Path("f/data")
+    for name in ORDER[1:]:
+        assert inputs[name]["dataset"] == Path("f/data") and inputs[name]["out"] == Path("f", name)
+    assert inputs["train-hierarchy"]["encoder"] == "f/train-encoder/model.safetensors"
+    assert inputs["eval"]["checkpoint"] == inputs["scale"]["checkpoint"] == "f/train-hierarchy"
+    assert document["report"] == "f/report.html" and document["eval"] == {"stage": "eval"}
+
+
+def test_a_finished_folder_prints_its_result_again(shell, calls):
+    first = shell("reproduce", "--out", "f", "--json").document
+    again = shell("reproduce", "--out", "f", "--json").document
+    assert again == first and len(calls) == 1 + len(ORDER)
+
+
+def test_what_stops_a_stage_stops_here_and_the_same_command_goes_on(shell, calls):
+    calls[0].append("train-encoder")
+    outcome = shell("reproduce", "--out", "f", "--quiet")
+    assert_one_line_error(outcome, 70, "gate")
+    assert [name for name, _ in calls[1:]] == ORDER[:2]
+    events = [json.loads(line) for line in Path("f/events.jsonl").read_text().splitlines()]
+    assert [event.get("stage") for event in events if event["event"] == "finished"] == ["collect"]
+    calls[0].clear()
+    assert shell("reproduce", "--out", "f", "--quiet").out == "f/report.html\n"
+
+
+@pytest.mark.parametrize("preset", ["default", "paper", "smoke", "gym"])
+def test_dry_run_plans_all_stages_and_writes_nothing(shell, preset):
+    with shell.untouched():
+        plan = shell("reproduce", "--preset", preset, "--dry-run", "--json").document["plan"]
+    stages = [line.split(":")[0] for line in plan["work"]]
+    assert list(dict.fromkeys(stages)) == ORDER
+    single = shell("train-encoder", "--preset", preset, "--dry-run", "--json").document["plan"]
+    assert plan["seconds"] > single["seconds"]
+
+
+def test_the_stages_take_what_they_are_given():
+    """The stand-ins accept anything; the real stages must accept the same."""
+    import inspect
+
+    from hjepa_cli.screen import Screen
+    from hjepa_cli.settings import load_settings
+
+    settings, screen = load_settings("smoke"), Screen(quiet=True)
+    bound = []
+    with pytest.MonkeyPatch.context() as patch:
+        for module in MODULES:
+            signature = inspect.signature(module.run)
+
+            def run(*given, signature=signature, **named):
+                bound.append(signature.bind(*given, **named))
+                return {}
+
+            patch.setattr(module, "run", run)
+        for stage in reproduce.stages(settings, screen, Path("f")).values():
+            stage()
+    assert len(bound) == len(ORDER)
