@@ -4,6 +4,7 @@
 it is and what it may be, whether it came from a flag or a file.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -60,9 +61,7 @@ def check_settings(settings: Settings) -> None:
     gaps = settings.protocol.gaps
     if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
         raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on")
-    bits = settings.protocol.payload_bits_per_value
-    if not 2 <= bits <= 16:
-        raise UsageError(f"protocol.payload_bits_per_value = {bits}; expected 2 to 16")
+    parse_payload(settings.protocol.payload)
     if settings.collect.steps < 2:
         raise UsageError(f"collect.steps = {settings.collect.steps}; expected at least 2")
     if settings.radio.bandwidth_hz > LARGEST_BANDWIDTH_HZ:
@@ -104,6 +103,28 @@ def check_methods(methods: tuple[str, ...]) -> None:
     for method in methods:
         if method not in METHODS:
             raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
+
+
+def parse_payload(name: str) -> tuple[str, int, int]:
+    """Read the name of a payload.
+
+    Returns:
+        Its kind (``float32``, ``float16``, ``int``, ``pca``), bits per value, and components.
+
+    Raises:
+        UsageError: no such payload.
+    """
+    if name in ("float32", "float16"):
+        return name, int(name[-2:]), 0
+    if (whole := re.fullmatch(r"int(\d{1,2})", name)) and 2 <= int(whole[1]) <= 16:
+        return "int", int(whole[1]), 0
+    parts = re.fullmatch(r"pca-(\d{1,3})x(\d{1,2})", name)
+    if parts and 1 <= int(parts[1]) <= 256 and 1 <= int(parts[2]) <= 16:
+        return "pca", int(parts[2]), int(parts[1])
+    raise UsageError(
+        f"unknown payload '{name}'; choose float32, float16, int2 … int16, or pca-NxB for N "
+        "principal components (1 to 256) of B bits (1 to 16), like pca-8x6"
+    )
 
 
 def _check_number(key: str, value: float) -> None:

@@ -339,6 +339,7 @@ def evaluate(
     methods: options.Methods = None,
     process_noise: options.ProcessNoise = None,
     plant_spread: options.PlantSpread = None,
+    payload: options.Payload = None,
     remeasure: options.Remeasure = False,
     checkpoint: options.Checkpoint = None,
     dataset: options.CleanDataset = None,
@@ -364,6 +365,7 @@ def evaluate(
             "methods": options.split_names(methods),
             "protocol.process_noise": process_noise,
             "protocol.plant_spread": plant_spread,
+            "protocol.payload": payload,
         },
     )
     screen = Screen(quiet, as_json)
@@ -392,6 +394,7 @@ def scale(
     methods: options.Methods = None,
     process_noise: options.ProcessNoise = None,
     plant_spread: options.PlantSpread = None,
+    payload: options.Payload = None,
     remeasure: options.Remeasure = False,
     verify: options.Verify = False,
     checkpoint: options.Checkpoint = None,
@@ -418,6 +421,7 @@ def scale(
             "methods": options.split_names(methods),
             "protocol.process_noise": process_noise,
             "protocol.plant_spread": plant_spread,
+            "protocol.payload": payload,
             "radio.snr_db": snr,
             "radio.law": law,
             "radio.bandwidth_hz": None if bandwidth_mhz is None else bandwidth_mhz * 1e6,

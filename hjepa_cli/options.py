@@ -202,6 +202,16 @@ PlantSpread = Annotated[
         parser=number(0.0),
     ),
 ]
+Payload = Annotated[
+    str | None,
+    _setting(
+        LOOP,
+        "--payload",
+        "How an embedding is sent: float32, float16, int2 to int16, or pca-NxB for N principal "
+        "components of B bits.",
+        "NAME",
+    ),
+]
 Remeasure = Annotated[
     bool, _plain(LOOP, "--remeasure", "Measure the closed-loop curves again, cached or not.")
 ]

@@ -131,7 +131,7 @@ class ProtocolSettings:
     noise_theta_dot_rad_s: float
     process_noise: Literal["velocity", "isotropic"]
     plant_spread: float
-    payload_bits_per_value: int
+    payload: str
     gaps: tuple[int, ...]
     acceptable_score: float
     acceptable_lq_ratio: float
