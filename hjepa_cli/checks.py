@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hjepa_cli.errors import UsageError
-from hjepa_cli.settings import Settings
+from hjepa_cli.settings import RadioSettings, Settings
 
 # Spec §8: every method `eval` and `scale` may be asked for; those without a model are skipped.
 METHODS = (
@@ -37,11 +37,18 @@ METHODS = (
 # Those that send the true state: they render and encode nothing.
 TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
 
+SCHEDULERS = (
+    *("round-robin", "opportunistic", "max-aoi", "drift-plus-penalty", "whittle"),
+    "innovation",
+)
+
+CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 LARGEST_SEED = 2**63 - 1
 LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
 LARGEST_STRIDE = 10_000
-ZERO_ALLOWED = ("seed", "encoder.shift_px")  # counts that may be 0; all others start at 1
-NEGATIVE_ALLOWED = ("encoder.gate_",)  # an R² threshold may be negative
+# Counts that may be 0; all others start at 1.
+ZERO_ALLOWED = ("seed", "encoder.shift_px", "radio.overhead_bits")
+NEGATIVE_ALLOWED = ("encoder.gate_", "radio.power_dbm")  # thresholds of R²; decibels
 POSITIVE = ("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket")
 BELOW_ONE = ("actor.dropout", "encoder.ema_decay", "protocol.plant_spread", "protocol.bracket")
 
@@ -62,6 +69,7 @@ def check_settings(settings: Settings) -> None:
     if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
         raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on")
     parse_payload(settings.protocol.payload)
+    _check_radio(settings.radio)
     if settings.collect.steps < 2:
         raise UsageError(f"collect.steps = {settings.collect.steps}; expected at least 2")
     if settings.radio.bandwidth_hz > LARGEST_BANDWIDTH_HZ:
@@ -125,6 +133,27 @@ def parse_payload(name: str) -> tuple[str, int, int]:
         f"unknown payload '{name}'; choose float32, float16, int2 … int16, or pca-NxB for N "
         "principal components (1 to 256) of B bits (1 to 16), like pca-8x6"
     )
+
+
+def _check_radio(radio: RadioSettings) -> None:
+    if not radio.schedulers:
+        raise UsageError(f"no scheduler given; choose from {', '.join(SCHEDULERS)}")
+    for scheduler in radio.schedulers:
+        if scheduler not in SCHEDULERS:
+            raise UsageError(
+                f"unknown scheduler '{scheduler}'; choose from {', '.join(SCHEDULERS)}"
+            )
+    low, high = CARRIER_GHZ
+    if not low <= radio.carrier_ghz <= high:
+        raise UsageError(f"radio.carrier_ghz = {radio.carrier_ghz:g}; expected {low:g} to {high:g}")
+    if radio.coherence_slots < 1:
+        raise UsageError(f"radio.coherence_slots = {radio.coherence_slots:g}; expected 1 or more")
+    if radio.block_error > 0.5:
+        raise UsageError(f"radio.block_error = {radio.block_error:g}; expected at most 0.5")
+    if radio.topology == "hall" and radio.law != "scheduled":
+        raise UsageError(
+            f"topology hall is for the law scheduled; law {radio.law} starts from the SNR itself"
+        )
 
 
 def _check_number(key: str, value: float) -> None:

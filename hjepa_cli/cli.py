@@ -389,8 +389,13 @@ def evaluate(
 def scale(
     snr: options.Snr = None,
     law: options.Law = None,
+    scheduler: options.Schedulers = None,
+    topology: options.Topology = None,
     bandwidth_mhz: options.BandwidthMhz = None,
     noise: options.Noise = None,
+    power_margin_db: options.PowerMarginDb = None,
+    coherence_slots: options.CoherenceSlots = None,
+    seeds: options.Seeds = None,
     methods: options.Methods = None,
     process_noise: options.ProcessNoise = None,
     plant_spread: options.PlantSpread = None,
@@ -426,6 +431,11 @@ def scale(
             "radio.law": law,
             "radio.bandwidth_hz": None if bandwidth_mhz is None else bandwidth_mhz * 1e6,
             "radio.noise": noise,
+            "radio.schedulers": options.split_names(scheduler),
+            "radio.topology": topology,
+            "radio.power_margin_db": power_margin_db,
+            "radio.coherence_slots": coherence_slots,
+            "radio.seeds": seeds,
         },
     )
     screen = Screen(quiet, as_json)

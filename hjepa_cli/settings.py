@@ -144,10 +144,21 @@ class ProtocolSettings:
 class RadioSettings:
     """``scale``: the radio cell."""
 
-    law: Literal["duty", "equal"]
+    law: Literal["duty", "equal", "scheduled"]
     snr_db: str
     bandwidth_hz: float
     noise: Literal["fixed", "scaled"]
+    schedulers: tuple[str, ...]  # the rest is for the law "scheduled"
+    seeds: int
+    power_margin_db: float
+    coherence_slots: float
+    overhead_bits: int
+    block_error: float
+    topology: Literal["target", "hall"]
+    scenario: Literal["InF-LOS", "InF-SL", "InF-DL", "InF-SH", "InF-DH"]
+    carrier_ghz: float
+    power_dbm: float
+    noise_figure_db: float
 
 
 @dataclasses.dataclass(frozen=True)

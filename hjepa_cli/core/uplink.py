@@ -15,6 +15,7 @@ from hjepa_cli.core.fading import block_fading
 from hjepa_cli.core.growth import Growth
 from hjepa_cli.core.schedulers import REPORTING, SCHEDULERS, pick
 from hjepa_cli.core.schedulers.view import View
+from hjepa_cli.core.seeding import generator
 from hjepa_cli.errors import UsageError
 
 Floats = NDArray[np.float64]
@@ -25,6 +26,7 @@ CHECK_PERIOD = 4  # slots between a device's looks at its own camera, staggered 
 REPORT_AGAIN = 2.0  # times the last report: an innovation is reported once, and when it doubles
 REPORTS_PER_BLOCK = 1.0  # that δ is steered to: a candidate for every transmission
 STEERING = 0.02  # of ln δ per slot and excess report
+_ERRORS_KEY = 0xE5
 DELTA = (1e-3, 0.5)  # range of δ, in parts of the force range
 
 
@@ -38,6 +40,7 @@ class Access:
         margin_db: G, of each device or all: fades deeper than this block a device; ∞ blocks nobody.
         k_factor_db: Rician K, of each device or all; −∞ is Rayleigh.
         coherence_slots: mean slots a fade lasts.
+        block_error: share of transmissions that fail although the power sufficed.
         growth: of the control error with age, measured for the controller.
         seed: of the fading.
     """
@@ -47,6 +50,7 @@ class Access:
     margin_db: float | Floats
     k_factor_db: float | Floats
     coherence_slots: float
+    block_error: float
     growth: Growth
     seed: int
 
@@ -85,6 +89,7 @@ class Uplink:
             k_factor_db=access.k_factor_db,
             coherence_slots=access.coherence_slots,
         )
+        self._errors = generator(access.seed, _ERRORS_KEY)
         self._threshold = 10.0 ** (-_each(access.margin_db, devices) / 10.0)
         self._fair_age = devices / access.blocks
         self._slot = 0
@@ -142,7 +147,8 @@ class Uplink:
             growth=self._access.growth,
         )
         chosen = pick(self._score(view), self._access.blocks)
-        arrived = chosen & self._able if self._slot else np.ones_like(chosen)
+        decoded = self._errors.random(len(chosen)) >= self._access.block_error
+        arrived = chosen & self._able & decoded if self._slot else np.ones_like(chosen)
         self._waited = np.where(chosen, 0, self._waited) + 1
         self._queue = np.maximum(self._queue - self._fair_age, 0.0) + self._age
         self._age = np.where(arrived, 0, self._age) + 1
