@@ -6,25 +6,27 @@ import json
 import math
 
 import pytest
-from command_line import hjepa
+from command_line import assert_one_line_error, open_shell
 
-from hjepa_cli.core.bench import Bench
+from hjepa_cli.core import scheduled as core_scheduled
 from hjepa_cli.core.coding import packet_uses
+from hjepa_cli.core.loop import Draws, every_step, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.simulator import Simulator
+from hjepa_cli.core.plant import plant
 from hjepa_cli.core.uplink import report_bits
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
 from hjepa_cli.stages import scale
 
-SMALL = {"protocol.steps": 250, "protocol.bracket": 0.1, "protocol.bootstrap": 200}
+SMALL = {"protocol.steps": 150, "protocol.bracket": 0.2, "protocol.bootstrap": 200}
 
 
 @pytest.fixture
 def stage(tmp_path, monkeypatch):
     """The stage in an empty directory; returns a function of its settings."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(core_scheduled, "BLOCK_DEVICES", 100)
 
     def call(*methods, verify=False, **flags):
         given = {"radio." + key: value for key, value in flags.items()}
@@ -40,15 +42,18 @@ def stage(tmp_path, monkeypatch):
 def test_round_robin_without_fading_agrees_with_duty(stage):
     result = stage("hold-true", schedulers=["round-robin"], power_margin_db=300.0, snr_db="20")
     (row,) = result["rows"]
-    settings = load_settings(flags={**SMALL, "protocol.bracket_devices": 200})
-    bench = Bench(settings.protocol, 0, Simulator(settings, None))
-    entry = bench.entry(build_method("hold-true", settings, None))
-    gap = entry["tolerance_gap_steps"]
-    # Both are interpolated within brackets of 10 %, and their blocks differ in who sends when.
-    assert row["load_per_block"] == pytest.approx(gap, abs=1 + 0.02 * gap)
-    c = 20e3 * math.log2(101) / 2064
-    assert row["devices"] == math.floor(row["load_per_block"] * c)
-    assert row["bits_per_s"] == pytest.approx(2064e3 / row["load_per_block"], rel=0.01)
+    load = row["load_per_block"]
+    # Under duty a gap of D = load has the acceptable score: the same loops, other turns.
+    settings = load_settings(flags=SMALL)
+    draws, method = Draws.make(settings.protocol, 150, 0), build_method("hold-true", settings, None)
+    gap = gap_schedule(load, draws.steps, 150)
+    scores = [
+        simulate(plant("desktop"), draws, schedule[None], method.controller(150), method.sensor)
+        for schedule in (gap, every_step(draws.steps, 150))
+    ]
+    assert scores[0].score.mean() / scores[1].score.mean() == pytest.approx(0.62, abs=0.03)
+    assert row["devices"] == math.floor(load * 20e3 * math.log2(101) / 2064)
+    assert row["bits_per_s"] == pytest.approx(2064e3 / load, rel=0.01)
 
 
 def test_document_table_and_reports(stage):
@@ -122,10 +127,11 @@ def test_what_cannot_be_scheduled(stage):
         (["--payload", "pca-8"], "unknown payload 'pca-8'"),
     ],
 )
-def test_bad_flags(flags, message, tmp_path):
-    done = hjepa("scale", "--law", "scheduled", *flags, cwd=tmp_path)
-    assert done.returncode == 2 and message in done.stderr
-    assert not list(tmp_path.iterdir())
+def test_bad_flags(flags, message, tmp_path, monkeypatch, capsys):
+    shell = open_shell(tmp_path, monkeypatch, capsys)
+    with shell.untouched():
+        outcome = shell("scale", "--law", "scheduled", *flags)
+    assert_one_line_error(outcome, 2, message)
 
 
 @pytest.mark.parametrize(

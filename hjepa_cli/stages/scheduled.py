@@ -8,6 +8,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.cell import Row, gain
 from hjepa_cli.core.cell_loop import measure_growth, simulate_cell
@@ -19,6 +21,7 @@ from hjepa_cli.core.loop import Draws, Floats, every_step, simulate
 from hjepa_cli.core.methods import Method, build_method
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.scheduled import (
+    BLOCK_DEVICES,
     MAX_BISECTIONS,
     MAX_LOAD,
     LoadPoint,
@@ -220,7 +223,7 @@ class ScheduledCell:
         outcome = simulate_cell(
             self._plant, self._settings.protocol, seed, devices, access, self._method(name)
         )
-        return LoadPoint(load, blocks, outcome, self._reference(seed)[:devices])
+        return LoadPoint(load, blocks, outcome, self._reference(seed, devices))
 
     def _links(self, snr_db: float, seed: int, devices: int) -> tuple[float | Floats, Any]:
         """Power margin and Rician K of the devices."""
@@ -246,17 +249,22 @@ class ScheduledCell:
             )
         return self._growth[name, seed]
 
-    def _reference(self, seed: int) -> Floats:
-        """The teacher's score of every device, on the true state at every step."""
-        if seed not in self._teacher:
+    def _reference(self, seed: int, devices: int) -> Floats:
+        """The teacher's score of the first devices, on the true state at every step."""
+        known = self._teacher.get(seed, np.zeros(0))
+        if len(known) < devices:  # the first of many devices are the few
+            count = BLOCK_DEVICES if devices <= BLOCK_DEVICES else MAX_LOAD
             protocol = self._settings.protocol
-            draws = Draws.make(protocol, MAX_LOAD, seed)
             teacher = build_method("optimal", self._settings, None)
-            always = every_step(protocol.steps, MAX_LOAD)[None]
-            controller = teacher.controller(MAX_LOAD)
-            outcome = simulate(self._plant, draws, always, controller, teacher.sensor)
-            self._teacher[seed] = outcome.score[0]
-        return self._teacher[seed]
+            outcome = simulate(
+                self._plant,
+                Draws.make(protocol, count, seed),
+                every_step(protocol.steps, count)[None],
+                teacher.controller(count),
+                teacher.sensor,
+            )
+            known = self._teacher[seed] = outcome.score[0]
+        return known[:devices]
 
 
 def gains(
