@@ -4,11 +4,12 @@
 it is and what it may be, whether it came from a flag or a file.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hjepa_cli.errors import UsageError
-from hjepa_cli.settings import Settings
+from hjepa_cli.settings import RadioSettings, Settings
 
 # Spec §8: every method `eval` and `scale` may be asked for; those without a model are skipped.
 METHODS = (
@@ -36,11 +37,18 @@ METHODS = (
 # Those that send the true state: they render and encode nothing.
 TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
 
+SCHEDULERS = (
+    *("round-robin", "opportunistic", "max-aoi", "drift-plus-penalty", "whittle"),
+    "innovation",
+)
+
+CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 LARGEST_SEED = 2**63 - 1
 LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
 LARGEST_STRIDE = 10_000
-ZERO_ALLOWED = ("seed", "encoder.shift_px")  # counts that may be 0; all others start at 1
-NEGATIVE_ALLOWED = ("encoder.gate_",)  # an R² threshold may be negative
+# Counts that may be 0; all others start at 1.
+ZERO_ALLOWED = ("seed", "encoder.shift_px", "radio.overhead_bits")
+NEGATIVE_ALLOWED = ("encoder.gate_", "radio.power_dbm")  # thresholds of R²; decibels
 POSITIVE = ("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket")
 BELOW_ONE = ("actor.dropout", "encoder.ema_decay", "protocol.plant_spread", "protocol.bracket")
 
@@ -60,9 +68,8 @@ def check_settings(settings: Settings) -> None:
     gaps = settings.protocol.gaps
     if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
         raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on")
-    bits = settings.protocol.payload_bits_per_value
-    if not 2 <= bits <= 16:
-        raise UsageError(f"protocol.payload_bits_per_value = {bits}; expected 2 to 16")
+    parse_payload(settings.protocol.payload)
+    _check_radio(settings.radio)
     if settings.collect.steps < 2:
         raise UsageError(f"collect.steps = {settings.collect.steps}; expected at least 2")
     if settings.radio.bandwidth_hz > LARGEST_BANDWIDTH_HZ:
@@ -104,6 +111,49 @@ def check_methods(methods: tuple[str, ...]) -> None:
     for method in methods:
         if method not in METHODS:
             raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
+
+
+def parse_payload(name: str) -> tuple[str, int, int]:
+    """Read the name of a payload.
+
+    Returns:
+        Its kind (``float32``, ``float16``, ``int``, ``pca``), bits per value, and components.
+
+    Raises:
+        UsageError: no such payload.
+    """
+    if name in ("float32", "float16"):
+        return name, int(name[-2:]), 0
+    if (whole := re.fullmatch(r"int(\d{1,2})", name)) and 2 <= int(whole[1]) <= 16:
+        return "int", int(whole[1]), 0
+    parts = re.fullmatch(r"pca-(\d{1,3})x(\d{1,2})", name)
+    if parts and 1 <= int(parts[1]) <= 256 and 1 <= int(parts[2]) <= 16:
+        return "pca", int(parts[2]), int(parts[1])
+    raise UsageError(
+        f"unknown payload '{name}'; choose float32, float16, int2 … int16, or pca-NxB for N "
+        "principal components (1 to 256) of B bits (1 to 16), like pca-8x6"
+    )
+
+
+def _check_radio(radio: RadioSettings) -> None:
+    if not radio.schedulers:
+        raise UsageError(f"no scheduler given; choose from {', '.join(SCHEDULERS)}")
+    for scheduler in radio.schedulers:
+        if scheduler not in SCHEDULERS:
+            raise UsageError(
+                f"unknown scheduler '{scheduler}'; choose from {', '.join(SCHEDULERS)}"
+            )
+    low, high = CARRIER_GHZ
+    if not low <= radio.carrier_ghz <= high:
+        raise UsageError(f"radio.carrier_ghz = {radio.carrier_ghz:g}; expected {low:g} to {high:g}")
+    if radio.coherence_slots < 1:
+        raise UsageError(f"radio.coherence_slots = {radio.coherence_slots:g}; expected 1 or more")
+    if radio.block_error > 0.5:
+        raise UsageError(f"radio.block_error = {radio.block_error:g}; expected at most 0.5")
+    if radio.topology == "hall" and radio.law != "scheduled":
+        raise UsageError(
+            f"topology hall is for the law scheduled; law {radio.law} starts from the SNR itself"
+        )
 
 
 def _check_number(key: str, value: float) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from hjepa_cli import completion
-from hjepa_cli.checks import METHODS
+from hjepa_cli.checks import METHODS, SCHEDULERS
 from hjepa_cli.settings import PRESETS
 
 FILES, DATA, MODEL, LOOP, RADIO = "Files", "Data", "Model", "Closed loop", "Radio cell"
@@ -324,6 +324,16 @@ PlantSpread = Annotated[
         parser=number(0.0),
     ),
 ]
+Payload = Annotated[
+    str | None,
+    _setting(
+        LOOP,
+        "--payload",
+        "How an embedding is sent: float32, float16, int2 to int16, or pca-NxB for N principal "
+        "components of B bits.",
+        "NAME",
+    ),
+]
 Remeasure = Annotated[
     bool, _plain(LOOP, "--remeasure", "Measure the closed-loop curves again, cached or not.")
 ]
@@ -353,9 +363,11 @@ Law = Annotated[
     _one_of(
         RADIO,
         "--law",
-        "How devices share the band: by turns at controlled power, or all at once in equal parts.",
+        "How devices share the band: by turns at controlled power, all at once in equal parts, or "
+        "as a scheduler decides.",
         "duty",
         "equal",
+        "scheduled",
     ),
 ]
 BandwidthMhz = Annotated[
@@ -371,6 +383,50 @@ Noise = Annotated[
         "fixed",
         "scaled",
     ),
+]
+
+Schedulers = Annotated[
+    str | None,
+    _setting(
+        RADIO,
+        "--scheduler",
+        f"Schedulers of the law scheduled, separated by commas: {', '.join(SCHEDULERS)}.",
+        "A,B",
+    ),
+]
+Topology = Annotated[
+    str | None,
+    _one_of(
+        RADIO,
+        "--topology",
+        "Law scheduled: one power margin for all, or devices dropped into a factory hall.",
+        "target",
+        "hall",
+    ),
+]
+PowerMarginDb = Annotated[
+    float | None,
+    _setting(
+        RADIO,
+        "--power-margin-db",
+        "Law scheduled: deepest fade that power control makes up for.",
+        "DB",
+        parser=number(0.0),
+    ),
+]
+CoherenceSlots = Annotated[
+    float | None,
+    _setting(
+        RADIO,
+        "--coherence-slots",
+        "Law scheduled: mean number of slots that a fade lasts; 1: independent.",
+        "SLOTS",
+        parser=number(1.0),
+    ),
+]
+Seeds = Annotated[
+    int | None,
+    _count(RADIO, "--seeds", "Law scheduled: seeds to average over, counted up from --seed."),
 ]
 
 # --- report

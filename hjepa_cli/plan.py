@@ -31,6 +31,8 @@ RATES_PER_S = {  # two cores of a server CPU
 }
 SEARCH_POINTS = 6  # of a tolerance, as a rule
 
+SEARCH_LOADS, BLOCK_DEVICES = 8, 200  # of the law scheduled, as in core/scheduled.py
+
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
@@ -184,6 +186,8 @@ def plan_scale(
     """Plan of ``hjepa scale``."""
     radio = settings.radio
     subject = _subject(settings, checkpoint, dataset)
+    if radio.law == "scheduled":
+        return _plan_scheduled(settings, subject, out, snr_db)
     missing = _uncached(subject, remeasure=remeasure)
     methods = subject.measurable(settings.methods)
     work = [
@@ -252,6 +256,29 @@ def plan_view(
         writes=[] if live else [f"animation {out}"],
         writes_bytes=0 if live else 10_000 * 100 * devices * len(methods) // 4,
         seconds=10 + _seconds({"closed-loop frames": frames}),
+    )
+
+
+def _plan_scheduled(
+    settings: Settings, subject: "Subject", out: Path | None, snr_db: list[float]
+) -> Plan:
+    """Plan of ``hjepa scale --law scheduled``: every load is simulated, none is cached."""
+    radio = settings.radio
+    methods = [name for name in subject.measurable(settings.methods) if name != "optimal"]
+    searches = len(radio.schedulers) * radio.seeds
+    if radio.topology == "hall":  # margins depend on the SNR
+        searches *= len(snr_db)
+    return Plan(
+        command="scale",
+        reads=[f"model {subject.name}"],
+        work=[
+            f"simulate up to {SEARCH_LOADS} loads of about {BLOCK_DEVICES} devices for "
+            f"{settings.protocol.steps} slots in each of {searches} searches for "
+            f"{len(methods)} methods under {', '.join(radio.schedulers)}"
+        ],
+        writes=[f"run {_run('scale', out)} with the table (CSV)"],
+        writes_bytes=100_000,
+        seconds=5 + _drive_seconds(settings, methods, searches * SEARCH_LOADS * BLOCK_DEVICES),
     )
 
 

@@ -133,7 +133,7 @@ class ProtocolSettings:
     noise_theta_dot_rad_s: float
     process_noise: Literal["velocity", "isotropic"]
     plant_spread: float
-    payload_bits_per_value: int
+    payload: str
     gaps: tuple[int, ...]
     acceptable_score: float
     acceptable_lq_ratio: float
@@ -146,10 +146,21 @@ class ProtocolSettings:
 class RadioSettings:
     """``scale``: the radio cell."""
 
-    law: Literal["duty", "equal"]
+    law: Literal["duty", "equal", "scheduled"]
     snr_db: str
     bandwidth_hz: float
     noise: Literal["fixed", "scaled"]
+    schedulers: tuple[str, ...]  # the rest is for the law "scheduled"
+    seeds: int
+    power_margin_db: float
+    coherence_slots: float
+    overhead_bits: int
+    block_error: float
+    topology: Literal["target", "hall"]
+    scenario: Literal["InF-LOS", "InF-SL", "InF-DL", "InF-SH", "InF-DH"]
+    carrier_ghz: float
+    power_dbm: float
+    noise_figure_db: float
 
 
 @dataclasses.dataclass(frozen=True)

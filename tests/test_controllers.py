@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
 from hjepa_cli.core.dynamics import rk4_step
 from hjepa_cli.core.loop import Controller, Draws, every_step, gap_schedule, simulate
@@ -194,7 +195,10 @@ def embedding_controllers() -> dict[str, Controller]:
         "settings": settings.as_dict(),
     }
     model = Model(build_modules(architecture), metadata, "", "cpu")
-    return {name: embedding_method(name, model, 8).controller(2) for name in model.methods}
+    return {
+        name: embedding_method(name, model, Integers(256, 8)).controller(2)
+        for name in model.methods
+    }
 
 
 @pytest.mark.parametrize("build", [controllers, embedding_controllers])

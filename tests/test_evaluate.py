@@ -23,6 +23,7 @@ from hjepa_cli.core import executors
 from hjepa_cli.core import workers as workers_module
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.loop import Outcome
 from hjepa_cli.core.methods import embedding_method, embedding_sensor, true_state_method
 from hjepa_cli.core.model import Model, build_modules, tensors_of
@@ -43,6 +44,7 @@ from hjepa_cli.storage.runs import Run
 
 PIXELS = ("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero")
 DESKTOP = plant("desktop")
+INT8 = Integers(256, 8)
 
 
 def small(
@@ -572,7 +574,7 @@ def test_eval_uses_workers_where_they_are_worth_it(
 def test_the_sensor_renders_encodes_and_quantises(checkpoint: Path) -> None:
     model = Model.load(checkpoint, "cpu")
     states = np.random.default_rng(0).normal(size=(2, 5, 4)) * 0.05
-    sense = embedding_sensor(model, 8)
+    sense = embedding_sensor(model, INT8)
     camera = Camera(DESKTOP)
     frames = np.stack([camera.render(states[0]), camera.render(states[1])], axis=1)
     expected = quantise(model.encode(frames), 8)
@@ -585,7 +587,7 @@ def test_the_sensor_renders_encodes_and_quantises(checkpoint: Path) -> None:
 def test_large_batches_are_encoded_like_small_ones(checkpoint: Path) -> None:
     model = Model.load(checkpoint, "cpu")
     states = np.random.default_rng(0).normal(size=(2, 300, 4)) * 0.05
-    sense = embedding_sensor(model, 8)
+    sense = embedding_sensor(model, INT8)
     together = sense(states[0], states[1])
     assert together.shape == (300, 256)
     assert torch.allclose(together[290:], sense(states[0, 290:], states[1, 290:]), atol=0.05)
@@ -596,10 +598,10 @@ def test_embedding_methods_start_with_the_actor_s_force(checkpoint: Path) -> Non
     z = torch.randn(4, 256)
     expected = model.actor(z).detach().numpy()
     for name in PIXELS:
-        method = embedding_method(name, model, 8)
+        method = embedding_method(name, model, INT8)
         for controller in (method.controller(4), method.reactive(4)):
             assert controller.act(np.ones(4, dtype=bool), z) == pytest.approx(expected, abs=1e-3)
-    silent = embedding_method("zero", model, 8).controller(4)
+    silent = embedding_method("zero", model, INT8).controller(4)
     silent.act(np.ones(4, dtype=bool), z)
     assert silent.act(np.zeros(4, dtype=bool), None).tolist() == [0.0] * 4
 

@@ -77,7 +77,7 @@ def test_vectors_do_not_share_a_scale() -> None:
 @pytest.mark.parametrize("bits", [-1, 0, 1, 17])
 def test_impossible_bits_are_refused(bits: int) -> None:
     for call in (lambda: quantise(torch.ones(1, 4), bits), lambda: payload_bits(256, bits)):
-        with pytest.raises(UsageError, match=f"payload_bits_per_value = {bits}; .* 2 to 16"):
+        with pytest.raises(UsageError, match=f"payload of {bits} bits .* 2 to 16"):
             call()
 
 

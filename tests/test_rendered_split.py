@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.methods import embedding_sensor
 from hjepa_cli.core.plant import plant
 from hjepa_cli.screen import Screen
@@ -154,7 +155,7 @@ def test_the_closed_loop_encodes_the_same_pairs(
             return torch.ones(len(frames), 4)
 
     spy = Spy()
-    sense = embedding_sensor(spy, 8)  # type: ignore[arg-type]
+    sense = embedding_sensor(spy, Integers(4, 8))  # type: ignore[arg-type]
     previous, current = recorded.states[:, :-1], recorded.states[:, 1:]
     sense(previous.reshape(-1, 4).astype(float), current.reshape(-1, 4).astype(float))
     assert torch.equal(spy.frames, split.pairs(1))

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hjepa_cli.checks import CARRIER_GHZ
 from hjepa_cli.errors import UsageError
 
 FloatArray = npt.NDArray[np.float64]
 
-CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 DISTANCE_3D_M = (1.0, 600.0)  # validity of Table 7.4.1-1 for InF
 SNR_DB = (-100.0, 100.0)  # ours: wider than any link, narrow enough that nothing overflows
 THERMAL_NOISE_DBM_PER_HZ = -174.0  # kT at 290 K, rounded as in every link budget

@@ -55,15 +55,27 @@ class StrideController:
                 self._anchors = packets.new_zeros(len(delivered), packets.shape[1])
                 self._starts = self._anchors.clone()
             self._anchors[torch.from_numpy(delivered)] = packets
-        due = np.flatnonzero(delivered | (self._phase == self._planner.stride))
-        if len(due):
-            rows = torch.from_numpy(due)
+        played = self._plan(delivered | (self._phase == self._planner.stride))
+        self._phase += 1
+        return played
+
+    @torch.inference_mode()
+    def outlook(self) -> Floats:
+        """Forces of the coming step [n] as they will be without a packet; from the second step on.
+
+        ``act`` then plans only for those who do get a packet.
+        """
+        return self._plan(self._phase == self._planner.stride)
+
+    def _plan(self, due: Bools) -> Floats:
+        """Plan a stride for those who are due, and return everybody's force of this step."""
+        if due.any():
+            rows = torch.from_numpy(np.flatnonzero(due))
             self._starts[rows] = self._anchors[rows]
             forces_n, self._anchors[rows] = self._planner.plan(self._anchors[rows])
             self._forces_n[rows] = forces_n.float().cpu()
             self._phase[due] = 0
-        played = self._forces_n.numpy()[np.arange(len(delivered)), self._phase]
-        self._phase += 1
+        played = self._forces_n.numpy()[np.arange(len(due)), self._phase]
         return np.asarray(played, dtype=np.float64)
 
     @property
@@ -103,6 +115,10 @@ class LastForce:
             self._forces_n[delivered] = forces_n.float().cpu().numpy() if is_tensor else forces_n
         return self._forces_n.copy()
 
+    def outlook(self) -> Floats:
+        """Forces of the coming step [n] as they will be without a packet."""
+        return self._forces_n.copy() if self._keep else np.zeros_like(self._forces_n)
+
 
 class Oracle:
     """The ceiling for any predictor: the true state at each packet, exact equations in between.
@@ -135,3 +151,7 @@ class Oracle:
         # ±50 is where the loop clips true states too: a lost pole must not overflow.
         self._states = np.clip(self._advance(self._states, forces_n), -50.0, 50.0)
         return forces_n
+
+    def outlook(self) -> Floats:
+        """Forces of the coming step [n] as they will be without a packet."""
+        return np.clip(self._actor(self._states), -self._limit_n, self._limit_n)

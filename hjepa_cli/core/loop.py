@@ -74,18 +74,13 @@ class Draws:
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
         """Draw for ``devices`` devices, all derived from ``seed``."""
-        half_widths = np.array(
-            [protocol.x_m, protocol.x_dot_m_s, protocol.theta_rad, protocol.theta_dot_rad_s]
-        )
         initial = np.empty((devices, 4))
         noise = np.empty((protocol.steps, devices, 4))
         delivery = np.empty((protocol.steps, devices))
         mass_scale = np.empty((devices, 2))
         for device in range(devices):
-            random = generator(seed, _DRAWS_KEY, device)
-            initial[device] = random.uniform(-1, 1, 4) * half_widths
-            mass_scale[device] = 1 + protocol.plant_spread * random.uniform(-1, 1, 2)
-            delivery[:, device] = random.random(protocol.steps)
+            start, scale, uniforms, random = device_draws(protocol, seed, device)
+            initial[device], mass_scale[device], delivery[:, device] = start, scale, uniforms
             noise[:, device] = random.standard_normal((protocol.steps, 4))
         return cls(initial, noise * noise_per_step(protocol), delivery, mass_scale)
 
@@ -105,6 +100,22 @@ class Draws:
             self.delivery[:, devices],
             self.mass_scale[devices],
         )
+
+
+def device_draws(
+    protocol: ProtocolSettings, seed: int, device: int
+) -> tuple[Floats, Floats, Floats, np.random.Generator]:
+    """One device's initial state [4], mass factors [2], delivery uniforms [steps], and its stream.
+
+    The stream goes on with the standard normal noise of one step after the other.
+    """
+    half_widths = np.array(
+        [protocol.x_m, protocol.x_dot_m_s, protocol.theta_rad, protocol.theta_dot_rad_s]
+    )
+    random = generator(seed, _DRAWS_KEY, device)
+    initial = random.uniform(-1, 1, 4) * half_widths
+    mass_scale = 1 + protocol.plant_spread * random.uniform(-1, 1, 2)
+    return initial, mass_scale, random.random(protocol.steps), random
 
 
 def noise_per_step(protocol: ProtocolSettings) -> Floats:

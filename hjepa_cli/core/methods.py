@@ -16,10 +16,10 @@ from torch import Tensor
 
 from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core.camera import Camera
+from hjepa_cli.core.codecs import Codec, bits_of, build_codec
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
 from hjepa_cli.core.dynamics import rk4_step
 from hjepa_cli.core.loop import Controller, Floats, Sensor
-from hjepa_cli.core.payload import payload_bits, quantise
 from hjepa_cli.core.plant import Plant, plant
 from hjepa_cli.core.policy import teacher
 from hjepa_cli.errors import UsageError
@@ -60,13 +60,13 @@ def build_method(name: str, settings: Settings, model: "Model | None") -> Method
     Raises:
         UsageError: there is no model that holds it.
     """
-    bits = settings.protocol.payload_bits_per_value
+    payload = settings.protocol.payload
     if name in TRUE_STATE:
-        sent = payload_bits(settings.encoder.embedding, bits)
+        sent = bits_of(payload, settings.encoder.embedding)
         return true_state_method(name, plant(settings.plant), sent)
     if model is None:
         raise UsageError(f"method '{name}' needs a model", hint="hjepa train-hierarchy")
-    return embedding_method(name, model, bits)
+    return embedding_method(name, model, build_codec(payload, model, settings))
 
 
 def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Method:
@@ -90,7 +90,7 @@ def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Met
     return Method(name, true_state, build, reactive, bits_per_transmission, "state", uses_link)
 
 
-def embedding_method(name: str, model: "Model", bits_per_value: int) -> Method:
+def embedding_method(name: str, model: "Model", codec: Codec) -> Method:
     """A method that lives on a trained model's embeddings.
 
     Raises:
@@ -102,9 +102,8 @@ def embedding_method(name: str, model: "Model", bits_per_value: int) -> Method:
         build = functools.partial(LastForce, model.actor, keep=False)
     elif name != "hold":
         build = functools.partial(StrideController, model.planner(name))
-    bits = payload_bits(model.architecture["embedding"], bits_per_value)
-    sensor = embedding_sensor(model, bits_per_value)
-    return Method(name, sensor, build, reactive, bits, "embedding")
+    sensor = embedding_sensor(model, codec)
+    return Method(name, sensor, build, reactive, codec.bits, "embedding")
 
 
 def true_state(previous: Floats, states: Floats) -> Floats:
@@ -112,8 +111,8 @@ def true_state(previous: Floats, states: Floats) -> Floats:
     return states
 
 
-def embedding_sensor(model: "Model", bits_per_value: int) -> Callable[[Floats, Floats], Tensor]:
-    """Sensor: render the last two frames, encode, quantise, dequantise."""
+def embedding_sensor(model: "Model", codec: Codec) -> Callable[[Floats, Floats], Tensor]:
+    """Sensor: render the last two frames, encode, send through the codec."""
     camera = Camera(plant(model.plant_name))
 
     def sense(previous: Floats, states: Floats) -> Tensor:
@@ -123,7 +122,7 @@ def embedding_sensor(model: "Model", bits_per_value: int) -> Callable[[Floats, F
         for start in range(0, len(pairs), SENSOR_BATCH):
             frames = camera.render(pairs[start : start + SENSOR_BATCH].reshape(-1, 4))
             z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
-            received.append(quantise(z, bits_per_value))
+            received.append(codec.send(z))
         return torch.cat(received).to(model.device)
 
     return sense

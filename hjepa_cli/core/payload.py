@@ -68,6 +68,6 @@ def raw_frame_bits(frames: int, height_px: int, width_px: int) -> int:
 def _largest_code(bits_per_value: int) -> int:
     if not 2 <= bits_per_value <= 16:
         raise UsageError(
-            f"payload_bits_per_value = {bits_per_value}; choose a whole number from 2 to 16"
+            f"payload of {bits_per_value} bits per value; choose a whole number from 2 to 16"
         )
     return int(2 ** (bits_per_value - 1) - 1)

@@ -13,7 +13,7 @@ from typing import Any
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.cell import Cell, Need, Row, gain
 from hjepa_cli.core.plant import plant
-from hjepa_cli.errors import MissingInputError, NumericalError
+from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.evaluate import Subject, curves_for, measure_points, open_subject
@@ -59,6 +59,8 @@ def run(
         DataError: a damaged checkpoint, or one of another plant.
         NumericalError: ``verify`` does not confirm a tolerance.
     """
+    if settings.radio.law == "scheduled":
+        return run_scheduled(settings, screen, checkpoint, out, verify)
     grid_db = parse_snr(settings.radio.snr_db)
     subject = open_subject(settings, screen, checkpoint, dataset)
     skipped = subject.skipped(settings.methods)
@@ -106,6 +108,17 @@ def run(
         show(result, screen)
         enforce(result.get("verify", []), level)
         return result
+
+
+def run_scheduled(
+    settings: Settings, screen: Screen, checkpoint: str | None, out: Path | None, verify: bool
+) -> dict[str, Any]:
+    """Hand over to the law that is simulated, not computed from curves."""
+    from hjepa_cli.stages import scheduled
+
+    if verify:
+        raise UsageError("--verify is for the laws duty and equal; scheduled simulates every count")
+    return scheduled.run(settings, screen, checkpoint=checkpoint, out=out)
 
 
 def cell_of(settings: Settings) -> Cell:
@@ -166,10 +179,10 @@ def enforce(checks: Sequence[Row], level: float) -> None:
         )
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> Path:
+def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str] = CSV_COLUMNS) -> Path:
     """Write the rows in long format: a line per SNR and method, units in the header."""
     text = io.StringIO()
-    table = csv.DictWriter(text, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
+    table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     table.writeheader()
     for row in rows:
         low, high = row["devices_ci95"] or (None, None)

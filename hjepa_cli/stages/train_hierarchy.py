@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from hjepa_cli.core import health, levels
 from hjepa_cli.core.bench import control_errors
+from hjepa_cli.core.codecs import build_codec
 from hjepa_cli.core.hierarchy import Strides
 from hjepa_cli.core.levels import EmbeddedTrajectories
 from hjepa_cli.core.methods import embedding_method
@@ -313,7 +314,7 @@ def nmae_windows(model: Model, data: Dataset, settings: Settings) -> dict[str, f
     clean = data.split("clean")
     limit_n = plant(settings.plant).force_limit_n
     errors = control_errors(
-        embedding_method("hjepa", model, settings.protocol.payload_bits_per_value),
+        embedding_method("hjepa", model, build_codec(settings.protocol.payload, model, settings)),
         clean.states.astype(float),
         clean.teacher_n.astype(float),
         limit_n,

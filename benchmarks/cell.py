@@ -1,0 +1,69 @@
+"""How the cost of a simulated cell grows with devices and slots, and how fast fading is drawn.
+
+    python benchmarks/cell.py [--method oracle] [--checkpoint NAME|PATH] [--devices 50,200,800,2000]
+
+Prints the time of each size and of each part's share; linear growth means equal µs per device-slot.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import math
+import time
+
+import numpy as np
+
+from hjepa_cli.core.cell_loop import measure_growth, simulate_cell
+from hjepa_cli.core.fading import block_fading
+from hjepa_cli.core.methods import build_method
+from hjepa_cli.core.model import Model
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.uplink import Access
+from hjepa_cli.settings import load_settings
+from hjepa_cli.storage import zoo
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--method", default="oracle")
+    parser.add_argument("--checkpoint", help="zoo name, run directory or file")
+    parser.add_argument("--devices", default="50,200,800,2000")
+    parser.add_argument("--steps", default="100,200")
+    parser.add_argument("--schedulers", default="round-robin,max-aoi,innovation")
+    options = parser.parse_args()
+    started = time.perf_counter()
+    for _ in itertools.islice(block_fading(0, 1000), 1000):
+        pass
+    print(f"a million block-fading gains: {time.perf_counter() - started:.2f} s")
+    model = Model.load(zoo.resolve_model(options.checkpoint)) if options.checkpoint else None
+    settings = load_settings()
+    kind = plant(settings.plant)
+    method = build_method(options.method, settings, model)
+    growth = measure_growth(kind, settings.protocol, 1, method, longest=100)
+    for scheduler in options.schedulers.split(","):
+        for steps, devices in itertools.product(
+            map(int, options.steps.split(",")), map(int, options.devices.split(","))
+        ):
+            protocol = dataclasses.replace(settings.protocol, steps=steps)
+            access = Access(
+                scheduler=scheduler,
+                blocks=max(1, devices // 100),
+                margin_db=10.0,
+                k_factor_db=-math.inf,
+                coherence_slots=1.0,
+                block_error=0.0,
+                growth=growth,
+                seed=0,
+            )
+            started = time.perf_counter()
+            outcome = simulate_cell(kind, protocol, 0, devices, access, method)
+            took_s = time.perf_counter() - started
+            print(
+                f"{scheduler:18} {devices:5} devices x {steps:5} slots: {took_s:7.2f} s, "
+                f"{1e6 * took_s / (devices * steps):7.2f} us per device-slot, "
+                f"score {np.mean(outcome.score):.3f}"
+            )
+
+
+if __name__ == "__main__":
+    main()

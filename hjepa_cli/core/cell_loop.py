@@ -1,0 +1,209 @@
+"""Many closed loops that compete for one uplink: plants, scheduler and one shared controller.
+
+As :mod:`hjepa_cli.core.loop`, step by step, but who gets through is decided while it runs. Cameras
+and encoders run only for devices that send, and for those that a reporting scheduler has look.
+Memory does not grow with the number of slots.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hjepa_cli.core.controllers import Bools
+from hjepa_cli.core.growth import Growth, conformal_growth
+from hjepa_cli.core.loop import (
+    STATE_LIMIT,
+    Controller,
+    Sensor,
+    device_draws,
+    noise_per_step,
+)
+from hjepa_cli.core.methods import Method
+from hjepa_cli.core.metrics import control_error, in_band, stage_cost
+from hjepa_cli.core.plant import CartPoles, Plant
+from hjepa_cli.core.uplink import Access, Uplink
+from hjepa_cli.errors import NumericalError
+from hjepa_cli.settings import ProtocolSettings
+
+Floats = NDArray[np.float64]
+
+CHUNK_STEPS = 256
+
+
+class ForesightedController(Controller, Protocol):
+    """A controller that can say what it will play if nothing arrives."""
+
+    def outlook(self) -> Floats:
+        """Forces of the coming step [n]."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class CellOutcome:
+    """What a simulated cell measured.
+
+    Attributes:
+        score, cost: means over the steps of each device [N].
+        packets: delivered to each device's controller, without the first [N].
+        reports: innovation reports of all devices.
+        steps: simulated.
+    """
+
+    score: Floats
+    cost: Floats
+    packets: NDArray[np.int64]
+    reports: int
+    steps: int
+
+
+def simulate_cell(
+    plant: Plant,
+    protocol: ProtocolSettings,
+    seed: int,
+    devices: int,
+    access: Access,
+    method: Method,
+    *,
+    tick: Callable[[int], None] = lambda steps: None,
+) -> CellOutcome:
+    """Run N closed loops on J resource blocks.
+
+    Args:
+        plant: of all devices; masses vary with ``protocol.plant_spread``.
+        protocol: initial states, noise, steps.
+        seed: of the draws, which are those of :class:`~hjepa_cli.core.loop.Draws`.
+        devices: N.
+        access: the uplink and its scheduler.
+        method: what devices send and what the controller does.
+        tick: told the device-steps done.
+
+    Raises:
+        NumericalError: the controller returned a force that is not finite.
+    """
+    uplink, world = Uplink(access, devices), World(plant, protocol, seed, devices)
+    controller: Any = method.controller(devices)
+    packets, steps = np.zeros(devices, dtype=np.int64), protocol.steps
+    for k in range(steps):
+        uplink.begin()
+        if uplink.listens:
+            _report(uplink, world, controller, method, plant.force_limit_n)
+        arrived = uplink.grant()
+        packets += arrived if k else 0
+        world.move(controller.act(arrived, world.sense(method.sensor, arrived)))
+        tick(devices)
+    return CellOutcome(world.score / steps, world.cost / steps, packets, uplink.reports, steps)
+
+
+def measure_growth(
+    plant: Plant,
+    protocol: ProtocolSettings,
+    seed: int,
+    method: Method,
+    *,
+    devices: int = 39,
+    longest: int = 320,
+) -> Growth:
+    """Calibrate a method's growth table: one packet, then the loop runs on predicted forces alone.
+
+    Args:
+        plant, protocol, seed, method: as for :func:`simulate_cell`; use another seed than there.
+        devices: calibration loops.
+        longest: A_max in steps; fewer where the protocol is shorter.
+    """
+    longest = min(longest, protocol.steps - 1)
+    wanted = sorted({1, 2, longest, *np.geomspace(4, longest, 20).astype(int).tolist()})
+    ages = [age for age in wanted if age <= longest]
+    world = World(plant, protocol, seed, devices)
+    controller: Any = method.controller(devices)
+    everybody, nobody = np.ones(devices, dtype=bool), np.zeros(devices, dtype=bool)
+    world.move(controller.act(everybody, world.sense(method.sensor, everybody)))
+    errors = []
+    for age in range(1, longest + 1):
+        if age in ages:
+            planned = controller.outlook()
+            errors.append(_innovation(world, method, everybody, planned, plant.force_limit_n))
+        world.move(controller.act(nobody, None))
+    return conformal_growth(ages, np.stack(errors, axis=1))
+
+
+class World:
+    """The plants of a cell, driven by the draws of a seed.
+
+    Attributes:
+        score, cost: sums over the steps so far [N].
+    """
+
+    def __init__(self, plant: Plant, protocol: ProtocolSettings, seed: int, devices: int) -> None:
+        initial, mass_scale, self._noise = streamed_draws(protocol, devices, seed)
+        self._plant = plant
+        self._poles = CartPoles(plant, devices, mass_scale=mass_scale)
+        self._poles.states = initial
+        self._previous = initial
+        self._poles.step(np.zeros(devices))  # the camera needs the frame before k = 0
+        self._states = self._poles.states
+        self.score, self.cost = np.zeros(devices), np.zeros(devices)
+
+    def sense(self, sensor: Sensor, devices: Bools) -> Any:
+        """Packets of some devices; ``None`` where there are none."""
+        if not devices.any():
+            return None
+        return sensor(self._previous[devices], self._states[devices])
+
+    def move(self, forces_n: Floats) -> None:
+        """Score this step and go on to the next."""
+        if not np.isfinite(forces_n).all():
+            raise NumericalError("the controller's force is not finite")
+        limit_n = self._plant.force_limit_n
+        forces_n = np.clip(forces_n, -limit_n, limit_n)
+        self.score += in_band(self._states)
+        self.cost += stage_cost(
+            self._states, forces_n, self._plant.state_weights, self._plant.force_weight
+        )
+        self._previous = self._states
+        self._poles.step(forces_n)
+        moved = self._poles.states + next(self._noise)
+        self._poles.states = self._states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
+
+
+def streamed_draws(
+    protocol: ProtocolSettings, devices: int, seed: int
+) -> tuple[Floats, Floats, Iterator[Floats]]:
+    """The draws of :class:`~hjepa_cli.core.loop.Draws` without keeping them.
+
+    Returns:
+        Initial states [N, 4], mass factors [N, 2] and the noise of one step after the other [N, 4].
+    """
+    drawn = [device_draws(protocol, seed, device) for device in range(devices)]
+    initial = np.stack([draw[0] for draw in drawn])
+    mass_scale = np.stack([draw[1] for draw in drawn])
+
+    def noise() -> Iterator[Floats]:
+        streams, scale = [draw[3] for draw in drawn], noise_per_step(protocol)
+        while True:
+            chunk = [stream.standard_normal((CHUNK_STEPS, 4)) for stream in streams]
+            yield from np.stack(chunk, axis=1) * scale
+
+    return initial, mass_scale, noise()
+
+
+def _report(
+    uplink: Uplink, world: World, controller: Any, method: Method, force_limit_n: float
+) -> None:
+    """Let devices compare the controller's force with their own, and report."""
+    checking = uplink.checking()
+    if checking.any():
+        error = _innovation(world, method, checking, controller.outlook(), force_limit_n)
+        uplink.hear(checking, error)
+
+
+def _innovation(
+    world: World, method: Method, devices: Bools, planned_n: Floats, force_limit_n: float
+) -> Floats:
+    """|C(z) − ũ| ÷ 40 N of some devices: what their own packet would change in the force."""
+    packets = world.sense(method.sensor, devices)
+    count = int(devices.sum())
+    wanted_n = method.reactive(count).act(np.ones(count, dtype=bool), packets)
+    return control_error(planned_n[devices], wanted_n, force_limit_n)

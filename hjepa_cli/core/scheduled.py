@@ -1,0 +1,162 @@
+"""How many loops one resource block carries under a scheduler, found by simulating it.
+
+The load of a block is devices per transmission and slot. A light load is simulated on several
+blocks at once, so that every point has about as many devices.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from hjepa_cli.core import metrics
+from hjepa_cli.core.cell_loop import CellOutcome
+
+Floats = NDArray[np.float64]
+
+BLOCK_DEVICES = 200  # simulated at a time, about
+MAX_LOAD = 512
+MAX_BISECTIONS = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadPoint:
+    """One simulated load.
+
+    Attributes:
+        load: devices per block.
+        blocks: J.
+        outcome: of ``load · blocks`` devices.
+        reference: the teacher's score of the same devices [N].
+    """
+
+    load: int
+    blocks: int
+    outcome: CellOutcome
+    reference: Floats
+
+    @property
+    def score(self) -> float:
+        """Normalised score."""
+        return float(metrics.ratio(self.outcome.score, self.reference))
+
+    @property
+    def packets_per_slot(self) -> float:
+        """Delivered per block and slot."""
+        return float(self.outcome.packets.sum()) / (self.blocks * self.outcome.steps)
+
+    @property
+    def reports_per_slot(self) -> float:
+        """Innovation reports per block and slot."""
+        return self.outcome.reports / (self.blocks * self.outcome.steps)
+
+
+@dataclasses.dataclass(frozen=True)
+class SupportedLoad:
+    """The load at which the score falls to the acceptable one.
+
+    Attributes:
+        load: devices per block, interpolated between the simulated ones; 0 where not even a block
+            per device suffices.
+        interval: 95 %, over devices of one seed or over seeds.
+        at_least: still acceptable at the largest load tried.
+        packets_per_slot, reports_per_slot: per block, at the nearest load inside.
+        points: (load, score) as simulated, ascending.
+    """
+
+    load: float
+    interval: tuple[float, float]
+    at_least: bool
+    packets_per_slot: float
+    reports_per_slot: float
+    points: tuple[tuple[int, float], ...]
+
+
+def blocks_for(load: int) -> int:
+    """J, so that about :data:`BLOCK_DEVICES` devices are simulated."""
+    return max(1, BLOCK_DEVICES // load)
+
+
+def find_load(
+    simulate: Callable[[int], LoadPoint],
+    level: float,
+    bracket: float,
+    *,
+    replicates: int,
+    seed: int,
+) -> SupportedLoad:
+    """Bisect the load on a logarithmic scale, at most 8 times.
+
+    Args:
+        simulate: a load in 1 … :data:`MAX_LOAD`.
+        level: the acceptable score.
+        bracket: relative width at which to stop.
+        replicates, seed: of the bootstrap over devices. It takes devices as independent; they share
+            blocks, so that several seeds say more.
+    """
+    points: dict[int, LoadPoint] = {}
+    low, high = 1, MAX_LOAD
+    for _ in range(MAX_BISECTIONS):
+        middle = round(math.sqrt(low * high)) if points else round(math.sqrt(high))
+        if middle in points:
+            middle = min({low, high} - points.keys(), default=0)
+        if not middle:
+            break
+        points[middle] = simulate(middle)
+        if points[middle].score < level:
+            high = min(middle, high)
+        else:
+            low = max(middle, low)
+        both = low in points and high in points
+        if both and (high - low <= 1 or high / low <= 1 + bracket):
+            break
+    return _crossing([points[load] for load in sorted(points)], level, replicates, seed)
+
+
+def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
+    """Average over seeds, with Student's t interval over them."""
+    if len(found) == 1:
+        return found[0]
+    loads = np.array([one.load for one in found])
+    half = stats.t.ppf(metrics.TAILS[1], len(loads) - 1) * loads.std(ddof=1) / math.sqrt(len(loads))
+    mean = float(loads.mean())
+    return SupportedLoad(
+        load=mean,
+        interval=(max(mean - float(half), 0.0), mean + float(half)),
+        at_least=any(one.at_least for one in found),
+        packets_per_slot=float(np.mean([one.packets_per_slot for one in found])),
+        reports_per_slot=float(np.mean([one.reports_per_slot for one in found])),
+        points=tuple(point for one in found for point in one.points),
+    )
+
+
+def _crossing(
+    points: Sequence[LoadPoint], level: float, replicates: int, seed: int
+) -> SupportedLoad:
+    """Interpolate the load between the simulated ones, and bootstrap it over devices."""
+    loads = np.array([point.load for point in points], np.float64)
+    scores = np.array([point.score for point in points])
+    most = max(len(point.reference) for point in points)
+    weights = metrics.bootstrap_weights(most, replicates, seed)
+    drawn = np.stack(
+        [
+            metrics.ratio(point.outcome.score, point.reference, weights[:, : len(point.reference)])
+            for point in points
+        ],
+        axis=-1,
+    )
+    crossing = float(metrics.first_crossing(loads, scores, level, log=False))
+    low, high = metrics.interval(metrics.first_crossing(loads, drawn, level, log=False))
+    inside = [point for point in points if point.load <= crossing] or points[:1]
+    ends = {-math.inf: 0.0, math.inf: float(loads[-1])}
+    return SupportedLoad(
+        load=ends.get(crossing, crossing),
+        interval=(ends.get(float(low), float(low)), ends.get(float(high), float(high))),
+        at_least=crossing == math.inf,
+        packets_per_slot=inside[-1].packets_per_slot,
+        reports_per_slot=inside[-1].reports_per_slot,
+        points=tuple((point.load, point.score) for point in points),
+    )

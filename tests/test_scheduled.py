@@ -1,0 +1,152 @@
+"""``scale --law scheduled`` on the true-state methods."""
+
+import csv
+import io
+import json
+import math
+
+import pytest
+from command_line import assert_one_line_error, open_shell
+
+from hjepa_cli.core import scheduled as core_scheduled
+from hjepa_cli.core.coding import packet_uses
+from hjepa_cli.core.loop import Draws, every_step, gap_schedule, simulate
+from hjepa_cli.core.methods import build_method
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.uplink import report_bits
+from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import load_settings
+from hjepa_cli.stages import scale
+
+SMALL = {"protocol.steps": 150, "protocol.bracket": 0.2, "protocol.bootstrap": 200}
+
+
+@pytest.fixture
+def stage(tmp_path, monkeypatch):
+    """The stage in an empty directory; returns a function of its settings."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(core_scheduled, "BLOCK_DEVICES", 100)
+
+    def call(*methods, verify=False, **flags):
+        given = {"radio." + key: value for key, value in flags.items()}
+        law = {"radio.law": "scheduled", "methods": list(methods)}
+        call.out = io.StringIO()
+        screen = Screen(True, stdout=call.out, stderr=io.StringIO())
+        settings = load_settings(flags={**SMALL, **law, **given})
+        return scale.run(settings, screen, verify=verify)
+
+    return call
+
+
+def test_round_robin_without_fading_agrees_with_duty(stage):
+    result = stage("hold-true", schedulers=["round-robin"], power_margin_db=300.0, snr_db="20")
+    (row,) = result["rows"]
+    load = row["load_per_block"]
+    # Under duty a gap of D = load has the acceptable score: the same loops, other turns.
+    settings = load_settings(flags=SMALL)
+    draws, method = Draws.make(settings.protocol, 150, 0), build_method("hold-true", settings, None)
+    gap = gap_schedule(load, draws.steps, 150)
+    scores = [
+        simulate(plant("desktop"), draws, schedule[None], method.controller(150), method.sensor)
+        for schedule in (gap, every_step(draws.steps, 150))
+    ]
+    assert scores[0].score.mean() / scores[1].score.mean() == pytest.approx(0.62, abs=0.03)
+    assert row["devices"] == math.floor(load * 20e3 * math.log2(101) / 2064)
+    assert row["bits_per_s"] == pytest.approx(2064e3 / load, rel=0.01)
+
+
+def test_document_table_and_reports(stage):
+    schedulers = ["round-robin", "innovation"]
+    result = stage("hold-true", schedulers=schedulers, snr_db="10:20:10")
+    assert json.loads(json.dumps(result, allow_nan=False, default=str))["law"] == "scheduled"
+    assert [(row["snr_db"], row["scheduler"]) for row in result["rows"]] == [
+        (10.0, "round-robin"),
+        (10.0, "innovation"),
+        (20.0, "round-robin"),
+        (20.0, "innovation"),
+    ]
+    turns, ours = result["rows"][2:]
+    assert turns["reports_per_block_slot"] == 0 and ours["reports_per_block_slot"] > 0.3
+    assert result["rows"][0]["load_per_block"] == turns["load_per_block"]  # whatever the SNR
+    # Reports are paid for: N (packet + reports) is what a slot carries times the load.
+    bits = 2064 + ours["reports_per_block_slot"] * report_bits(ours["devices"])
+    slot_bits = 20e3 * math.log2(101)
+    assert ours["devices"] == math.floor(ours["load_per_block"] * slot_bits / bits)
+    low, high = ours["devices_ci95"]
+    assert low <= ours["devices"] <= high
+    (found,) = result["gains"]
+    assert found["ratio"] == ours["devices"] / turns["devices"]
+    printed = stage.out.getvalue()
+    assert "hold-true, innovation" in printed and "over round-robin at 20 dB" in printed
+    with open(result["csv"]) as file:
+        assert [int(row["devices"]) for row in csv.DictReader(file)] == [
+            row["devices"] for row in result["rows"]
+        ]
+
+
+def test_hall_coherence_and_seeds(stage):
+    result = stage(
+        "zero-true",
+        schedulers=["max-aoi"],
+        topology="hall",
+        coherence_slots=5.0,
+        seeds=2,
+        overhead_bits=24,
+        snr_db="20",
+    )
+    (row,) = result["rows"]
+    assert result["topology"] == "hall" and row["devices"] > 0
+    assert result["seeds"] == 2 and row["load_ci95"][0] < row["load_per_block"]
+    assert row["devices"] == math.floor(row["load_per_block"] * 20e3 / packet_uses(2064 + 24, 20.0))
+
+
+def test_a_slot_too_small_for_a_packet_is_said(stage):
+    result = stage("hold-true", bandwidth_hz=1e4, snr_db="10")
+    assert all(row["devices"] == 0 for row in result["rows"])
+    assert "takes 59.7 slots" in result["rows"][0]["reason"]
+
+
+def test_what_cannot_be_scheduled(stage):
+    with pytest.raises(UsageError, match="simulates every count"):
+        stage("hold-true", verify=True)
+    with pytest.raises(MissingInputError, match="nothing to schedule"):
+        stage("optimal")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--scheduler", "fifo"], "unknown scheduler 'fifo'"),
+        (["--scheduler", ","], "no scheduler"),
+        (["--coherence-slots", "0.5"], "0.5"),
+        (["--power-margin-db", "nan"], "nan"),
+        (["--seeds", "0"], "0"),
+        (["--topology", "street"], "street"),
+        (["--law", "duty", "--topology", "hall"], "topology hall"),
+        (["--payload", "pca-8"], "unknown payload 'pca-8'"),
+    ],
+)
+def test_bad_flags(flags, message, tmp_path, monkeypatch, capsys):
+    shell = open_shell(tmp_path, monkeypatch, capsys)
+    with shell.untouched():
+        outcome = shell("scale", "--law", "scheduled", *flags)
+    assert_one_line_error(outcome, 2, message)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"radio.carrier_ghz": 0.4},
+        {"radio.carrier_ghz": 101.0},
+        {"radio.block_error": 0.6},
+        {"radio.coherence_slots": 0.0},
+        {"radio.overhead_bits": -1},
+        {"radio.schedulers": []},
+    ],
+)
+def test_bad_settings(change):
+    from hjepa_cli.checks import check_settings
+
+    with pytest.raises(UsageError):
+        check_settings(load_settings(flags=change))
