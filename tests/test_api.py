@@ -12,6 +12,7 @@ from command_line import ENVIRONMENT, ROOT
 from test_evaluate import untrained
 
 import hjepa_cli
+from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.loop import play
 from hjepa_cli.core.methods import embedding_method
 from hjepa_cli.errors import UsageError
@@ -63,7 +64,7 @@ def test_predict_plays_what_the_controller_plays(model):
     z = torch.nn.functional.normalize(torch.randn(3, 256), dim=-1) * 16
     for method in ("hjepa", "ts-jepa-1"):
         forces_n, _ = hjepa_cli.predict(model, z, 11, method=method)
-        controller = embedding_method(method, model, 8).controller(3)
+        controller = embedding_method(method, model, Integers(256, 8)).controller(3)
         np.testing.assert_allclose(forces_n.numpy(), play(controller, z, 3, 11), rtol=1e-6)
     whole, z_whole = hjepa_cli.predict(model, z, 8)
     part, z_part = hjepa_cli.predict(model, z, 4)

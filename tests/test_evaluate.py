@@ -81,7 +81,12 @@ def untrained(path: Path, plant_name: str = "desktop", h: int = 4) -> Path:
     }
     torch.manual_seed(0)
     modules = build_modules(architecture)
-    metadata = {"architecture": architecture, "plant": plant_name, "settings": settings.as_dict()}
+    metadata = {
+        "architecture": architecture,
+        "plant": plant_name,
+        "settings": settings.as_dict(),
+        "health": {},
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     save_checkpoint(path, tensors_of(modules), metadata)
     return path

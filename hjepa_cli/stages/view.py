@@ -17,9 +17,10 @@ from hjepa_cli.core import health
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.capacity import equal_devices
 from hjepa_cli.core.channel import rayleigh_power_gains
+from hjepa_cli.core.codecs import bits_of
 from hjepa_cli.core.controllers import StrideController
 from hjepa_cli.core.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
-from hjepa_cli.core.methods import embedding_method
+from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import in_band
 from hjepa_cli.core.model import Model
 from hjepa_cli.core.plant import Plant, plant
@@ -218,9 +219,7 @@ def make_link(
     )
     delivered = gains >= -np.log(delivery)
     delivered[0] = True
-    bits = embedding_method(
-        "hold", model, settings.protocol.payload_bits_per_value
-    ).bits_per_transmission
+    bits = bits_of(settings.protocol.payload, model.architecture["embedding"])
     sharing = equal_devices(delivery, bits, settings.radio.bandwidth_hz, kind.step_s, snr_db)
     label = (
         f"Rayleigh fading, mean SNR {snr_db:g} dB, packets arrive with p = {delivery:g}: "
@@ -251,7 +250,7 @@ def film(
 ) -> Film:
     """Drive the devices with one method and keep every state and belief."""
     kind: Plant = plant(settings.plant)
-    method = embedding_method(name, model, settings.protocol.payload_bits_per_value)
+    method = build_method(name, settings, model)
     steps, devices = link.delivered.shape
     believer = Believer(method.controller(devices), probe)
     states: list[Floats] = []
