@@ -345,9 +345,16 @@ def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:
 
 
 def entry_of(score: float) -> dict[str, Any]:
+    lists = ("nmae", "nmae_ci95", "gap_curve", "delivery_curve")
+    tolerances = ("tolerance_gap_steps", "tolerance_gap_lq_steps", "tolerance_p")
+    counts = ("bits_per_transmission", "n_devices", "n_curve_devices", "n_rollouts")
     return {
-        **{key: [] for key in ("nmae", "nmae_ci95", "score_ci95", "gap_curve", "delivery_curve")},
-        **{key: 1.0 for key in ("tolerance_gap_steps", "tolerance_p", "bits_per_transmission")},
+        **{key: [] for key in lists},
+        **dict.fromkeys(tolerances, 1.0),
+        **dict.fromkeys(counts, 1),
+        **{key: [0.0, 2.0] for key in ("score_ci95", "tolerance_gap_ci95", "tolerance_p_ci95")},
+        **dict.fromkeys(("tolerance_gap_censored", "tolerance_p_censored"), False),
+        "nmae_windows": {},
         "score": score,
         "lq_ratio": 1.0,
     }
