@@ -12,8 +12,7 @@ ARGS ?=
 
 demo:
 	@scripts/venv plot
-	.venv/bin/hjepa scale --snr 10:30 --checkpoint desktop-h4m2l1 \
-	  --methods hjepa,ts-jepa-1,ts-jepa-4,hold,hold-true,oracle $(ARGS)
+	.venv/bin/hjepa scale --snr 10:30 --checkpoint desktop-h4m2l1 $(ARGS)
 
 test:
 	@scripts/venv test
