@@ -155,6 +155,27 @@ def test_rounds_of_both_searches_are_measured_together() -> None:
     assert batches[1:] == [6, 4]
 
 
+def test_a_wide_interval_takes_few_rounds() -> None:
+    """Sixteen devices that tell nothing: the interval is the whole grid."""
+    protocol = dataclasses.replace(PROTOCOL, curve_devices=16, bracket_devices=16)
+    fake = Fake(falling(300.0, slope=0.02), spread=2.0)
+    fake.offsets = fake.offsets[:16] - fake.offsets[:16].mean()
+    batches = []
+    measure = fake.measure
+
+    def counting(points: Sequence[Point], devices: int) -> Outcome:
+        batches.append(len(points))
+        return measure(points, devices)
+
+    ones = np.ones(16)
+    reference = Reference(ones, ones, protocol.bootstrap, seed=0)
+    first = Outcome(*(values[:, :16] for values in fake._first()))
+    curves = measure_curves(counting, first, reference, protocol)
+    found = curves.searches["gap"].result()
+    assert found.interval[0] < 2 and found.interval[1] == 320.0
+    assert len(batches) <= 12
+
+
 def test_a_grid_of_one_point_works() -> None:
     protocol = dataclasses.replace(PROTOCOL, gaps=(1,))
     found = Fake(lambda gap: 0.9).curves(protocol).searches["gap"].result()

@@ -143,6 +143,7 @@ class Search:
         self._level, self._bracket = protocol.acceptable_score, protocol.bracket
         self._step_out = 1 + STEP_OUT * protocol.bracket
         self._rounds = 0
+        self._steps_down = self._steps_up = 1
 
     @property
     def points(self) -> list[Point]:
@@ -182,14 +183,16 @@ class Search:
         return ends or self._next_for_interval()
 
     def _next_for_interval(self) -> Sequence[float]:
-        """Widen the measured range until the interval lies inside it."""
+        """Widen the measured range until the interval lies inside it, in steps that double."""
         first, last = min(self._measured), max(self._measured)
         low, high = self._interval()
         wider = []
         if low == -math.inf:
-            wider.append(max(first / self._step_out, min(self._grid)))
+            self._steps_down *= 2
+            wider.append(max(first / self._step_out ** (self._steps_down / 2), min(self._grid)))
         if high == math.inf:
-            wider.append(min(last * self._step_out, max(self._grid)))
+            self._steps_up *= 2
+            wider.append(min(last * self._step_out ** (self._steps_up / 2), max(self._grid)))
         return wider
 
     def _best_known(self) -> dict[float, float]:
