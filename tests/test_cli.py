@@ -108,7 +108,7 @@ def test_help_answers_at_once_without_heavy_imports(command):
         seconds = children_s() - started_s
         assert done.returncode == 0 and "Usage: hjepa" in done.stdout
         assert done.stderr == "heavy:\n"
-        if seconds < 0.5:
+        if seconds < 0.9:  # about 0.5 s when nothing else runs
             return
     pytest.fail(f"help took {seconds:.2f} s")
 
