@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from hjepa_cli.core.camera import HEIGHT_PX, PIVOT_ROW_PX, WIDTH_PX, Camera
-from hjepa_cli.core.plant import Plant
+from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.system import System
 from hjepa_cli.errors import MissingInputError, StorageError, UsageError
 from hjepa_cli.pictures import FAINT, INK, PAPER, font
 from hjepa_cli.storage import files
@@ -47,10 +47,10 @@ class Pictures:
         every: control steps between pictures.
     """
 
-    def __init__(self, films: "Sequence[Film]", link: "Link", kind: Plant, every: int) -> None:
+    def __init__(self, films: "Sequence[Film]", link: "Link", kind: System, every: int) -> None:
         self.films, self.link, self.kind = films, link, kind
         self.steps = list(range(0, len(link.delivered), every))
-        self._camera = Camera(kind)
+        self._camera = kind.camera()
         self.devices = link.delivered.shape[1]
         width = max(self.devices * (PANEL_PX[0] + MARGIN_PX) + MARGIN_PX, LEAST_WIDTH_PX)
         height = len(films) * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX
@@ -68,7 +68,7 @@ class Pictures:
         draw = ImageDraw.Draw(picture)
         clock = f"t = {1e3 * k * self.kind.step_s:.0f} ms   {self.link.label}"
         draw.text((MARGIN_PX, 3), clock, FAINT, font())
-        legend = "dashed: where the controller believes the pole; bar: packet arrived"
+        legend = "dashed: what the controller believes; bar: packet arrived"
         legend += "; tick: lost" if self.link.sends_always else ""
         draw.text((MARGIN_PX, 17), legend, FAINT, font())
         for row, shot in enumerate(self.films):
@@ -98,6 +98,15 @@ class Pictures:
         snr_db = self.link.snr_db[k, device]
         return f"packet {age_ms:.0f} ms old   SNR {snr_db:.0f} dB"
 
+    def error(self, shot: "Film", device: int, k: int) -> str:
+        """How far the belief is off in the first angle, else in the first state."""
+        names, units = self.kind.state_names, self.kind.state_units
+        which = units.index("rad") if "rad" in units else 0
+        error = shot.believed[k, device, which] - shot.states[k, device, which]
+        if units[which] == "rad":
+            return f"believed − true {names[which]}: {np.degrees(error):+.1f}°"
+        return f"believed − true {names[which]}: {error:+.2g} {units[which]}"
+
     def _panel(self, shot: "Film", device: int, k: int) -> Image.Image:
         panel = Image.new("RGB", PANEL_PX, PAPER)
         draw = ImageDraw.Draw(panel)
@@ -110,15 +119,14 @@ class Pictures:
         return panel
 
     def _draw_belief(self, draw: ImageDraw.ImageDraw, state: NDArray[np.float64]) -> None:
-        """The believed cart as an outline, the believed pole as a dashed line."""
-        scale = self._camera.scale_px_m * SCALE
-        pivot = np.array([WIDTH_PX * SCALE / 2 + state[0] * scale, PIVOT_ROW_PX * SCALE])
-        half = np.array(self.kind.cart_size_m) / 2 * scale
-        draw.rectangle([*(pivot - half), *(pivot + half)], outline=(0, 0, 0))
-        way = 2 * self.kind.half_length_m * scale * np.array([np.sin(state[2]), -np.cos(state[2])])
+        """The axis of the believed state as a dashed line, the rest of it as an outline."""
+        (start, end), *outlines = (line * SCALE for line in self._camera.sketch_px(state))
+        for line in outlines:
+            draw.line([tuple(point) for point in line], fill=(0, 0, 0))
+        way = end - start
         dashes = max(int(np.hypot(*way) / DASH_PX), 1)
         for dash in range(dashes):  # black shows on the paper, white on the pole
-            ends = (pivot + way * dash / dashes, pivot + way * (dash + 1) / dashes)
+            ends = (start + way * dash / dashes, start + way * (dash + 1) / dashes)
             colour = (0, 0, 0) if dash % 2 == 0 else (255, 255, 255)
             draw.line([tuple(end) for end in ends], fill=colour, width=3)
 
@@ -197,10 +205,9 @@ def terminal_picture(pictures: Pictures, k: int) -> Any:
             arrived = pictures.link.delivered[k, device]
             lost = pictures.link.sends_always and not arrived
             mark, style = ("●", "green") if arrived else ("×" if lost else "·", "red")
-            believed = np.degrees(shot.believed[k, device, 2] - shot.states[k, device, 2])
             caption = Text(f"{mark} ", style=style)
             caption.append(pictures.caption(device, k), style="default")
-            caption.append(f"\n  θ̃ − θ = {believed:+.1f}°", style="dim")
+            caption.append(f"\n  {pictures.error(shot, device, k)}", style="dim")
             captions.append(caption)
         table.add_row(*captions)
     return table

@@ -66,7 +66,7 @@ def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tu
         method: a predictor that the model holds.
 
     Returns:
-        Forces in newton [n, steps], and the embeddings [n, D] after the last stride, which is
+        Forces in newton [n, steps, *A], and the embeddings [n, D] after the last stride, which is
         ``steps`` rounded up to a multiple of the stride ahead.
 
     Raises:
@@ -104,7 +104,7 @@ def drive(
         preset, settings: plant, seed and protocol (its steps K).
 
     Returns:
-        ``states`` [K, n, 4], ``forces_n`` [K, n], ``score`` [n] (share of steps inside the
+        ``states`` [K, n, S], ``forces_n`` [K, n, *A], ``score`` [n] (share of steps inside the
         band), ``cost`` [n] (mean capped quadratic cost).
 
     Raises:

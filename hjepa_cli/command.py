@@ -15,7 +15,7 @@ from hjepa_cli.checks import check_settings
 from hjepa_cli.errors import HjepaError, Interrupted, StorageError, UsageError
 from hjepa_cli.interrupts import exit_code, sigterm_raises
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.settings import PRESETS, Settings, load_settings
 
 Result = dict[str, Any]
 
@@ -32,14 +32,15 @@ def resolve(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -
     A plant has its own ranges and noise, so ``--plant gym`` alone means its preset.
     """
     plant = flags["plant"]
-    if preset is None and plant == "gym":
-        preset = "gym"
+    if preset is None and plant in PRESETS:
+        preset = plant
     settings = load_settings(preset, config, flags)
-    if plant is not None and (preset == "gym") != (plant == "gym"):
+    if plant is not None and (own := load_settings(preset).plant) != plant:
+        named = plant if plant in PRESETS else "default"
         raise UsageError(
-            f"preset '{settings.preset}' holds the ranges and noise of the other plant, "
+            f"preset '{settings.preset}' holds the ranges and noise of plant '{own}', "
             f"not of '{plant}'",
-            hint="--preset gym for plant gym, and --config FILE.toml for other values of it",
+            hint=f"--preset {named} for plant {plant}; other values of it by --config FILE.toml",
         )
     check_settings(settings)
     return settings

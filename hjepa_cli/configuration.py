@@ -35,7 +35,8 @@ def show(
     """
     sources = origins(settings.preset, config, flags)
     values = flat(settings.as_dict())
-    shown = [name for name in sources if not key or name == key or name.startswith(f"{key}.")]
+    named = [name for name in sources if not key or name == key or name.startswith(f"{key}.")]
+    shown = [name for name in named if name in values]  # empty lists say nothing
     if not shown:
         sections = sorted({name.split(".")[0] for name in sources})
         raise UsageError(f"no setting or section '{key}'; choose from {', '.join(sections)}")

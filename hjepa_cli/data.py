@@ -1,14 +1,14 @@
 """``hjepa data info | verify | preview | export``: what a dataset is, and whether it is intact."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
+from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.plant import plant
-from hjepa_cli.core.policy import teacher
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError
 from hjepa_cli.plan import RATES_PER_S, Plan, size
 from hjepa_cli.screen import Screen
@@ -27,7 +27,6 @@ ROOT = Path("data")
 FORMATS = {"hdf5": (".h5", ".hdf5"), "npz": (".npz",)}  # the first suffix is written by default
 COMPRESSED_FRAME_BYTES = 700
 COMPRESSED_FRAMES_PER_S = 2_000.0
-STATES = ("x [m]", "x_dot [m/s]", "theta [rad]", "theta_dot [rad/s]")
 
 
 def show_info(screen: Screen, path: Path | None) -> Result:
@@ -80,7 +79,7 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
         verified.append({**summary(data), "states": ranges})
         screen.table(
             f"{path}: intact, sha256 {data.digest}",
-            ["split", *STATES, "force [N]"],
+            ["split", *labels(data.plant)],
             [[name, *map(interval, values)] for name, values in ranges.items()],
         )
     for further in damaged[1:]:
@@ -114,17 +113,14 @@ def preview(
     if recorded.frames is not None:
         frames = recorded.frames[:, steps + 1]
     else:
-        images = Camera(data.plant).render(shown.reshape(-1, 4))
+        images = plant(data.plant).camera().render(shown.reshape(-1, shown.shape[-1]))
         frames = images.reshape(*shown.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
-    labels = [
-        [
-            f"{split} {row}, k {step}, {recorded.applied_n[row, step]:+.1f} N"
-            for step in steps.tolist()
-        ]
+    captions = [
+        [f"{split} {row}, k {step}, {forces(recorded.applied_n[row, step])}" for step in steps]
         for row in range(len(recorded))
     ]
     target = out or Path(f"{data.path.name}-{split}.png")
-    pictures.save_png(pictures.contact_sheet(frames, labels), target)
+    pictures.save_png(pictures.contact_sheet(frames, captions), target)
     screen.say(f"{len(recorded)} trajectories of {data.path}: {target}")
     return {"dataset": str(data.path), "split": split, "picture": str(target)}
 
@@ -147,22 +143,22 @@ def export(
     data = opened(path, screen)
     recorded = data.split(split)
     target = out or default_name(data, split, kind)
-    limit_n = plant(data.plant).force_limit_n
-    values = exports.columns(recorded, teacher(data.plant)(recorded.states[:, 0]), limit_n)
+    system = plant(data.plant)
+    limit_n, camera = system.force_limit_n, system.camera()
+    values = exports.columns(recorded, system.teacher()(recorded.states[:, 0]), limit_n)
     about = {
         "dataset": data.digest,
         "plant": data.plant,
         "split": split,
         "force_limit_n": limit_n,
-        "step_s": plant(data.plant).step_s,
+        "step_s": system.step_s,
         "camera": data.camera,
     }
-    camera = Camera(data.plant)
 
     def film(part: Trajectories) -> np.ndarray:
         if part.frames is not None:
             return part.frames
-        images = camera.render(part.states.reshape(-1, 4))
+        images = camera.render(part.states.reshape(-1, part.states.shape[-1]))
         return images.reshape(*part.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
 
     with screen.progress("export", len(recorded), "trajectories") as bar:
@@ -221,9 +217,24 @@ def summary(data: Dataset) -> Result:
 
 
 def spread(split: Trajectories) -> list[list[float]]:
-    """[least, greatest] of the four states and of the applied force."""
-    series = [*np.moveaxis(split.states, -1, 0), split.applied_n]
+    """[least, greatest] of each state and of each applied force."""
+    driven = split.applied_n.reshape(len(split), split.steps, -1)
+    series = [*np.moveaxis(split.states, -1, 0), *np.moveaxis(driven, -1, 0)]
     return [[float(values.min()), float(values.max())] for values in series]
+
+
+def labels(plant_name: str) -> list[str]:
+    """What :func:`spread` is of: ``x [m]``, …, ``force [N]``."""
+    system = plant(plant_name)
+    states = zip(system.state_names, system.state_units, strict=True)
+    count = math.prod(system.action_shape)
+    numbers = [""] if count == 1 else [f" {number}" for number in range(1, count + 1)]
+    return [*(f"{name} [{unit}]" for name, unit in states), *(f"force{n} [N]" for n in numbers)]
+
+
+def forces(applied_n: np.ndarray) -> str:
+    """``+1.5 N``, or ``+0.2 -0.1 N`` where there are several."""
+    return " ".join(f"{force:+.1f}" for force in applied_n.reshape(-1)) + " N"
 
 
 def interval(ends: Sequence[float]) -> str:

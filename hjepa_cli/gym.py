@@ -22,7 +22,7 @@ from gymnasium import spaces
 
 from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
 from hjepa_cli.core.loop import STATE_LIMIT, noise_per_step
-from hjepa_cli.core.metrics import COST_CAP, in_band, stage_cost
+from hjepa_cli.core.metrics import COST_CAP
 from hjepa_cli.core.plant import CartPole
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.errors import UsageError
@@ -88,14 +88,12 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Start anywhere in the protocol's range of initial states."""
         super().reset(seed=seed)
         protocol = self._protocol
-        half_widths = np.array(
-            [protocol.x_m, protocol.x_dot_m_s, protocol.theta_rad, protocol.theta_dot_rad_s]
-        )
+        half_widths = np.array(protocol.half_widths)
         # A new simulation: what pymunk remembers of the last episode would move the last bits.
         self._pole = CartPole(self._kind)
         self._pole.state = self.np_random.uniform(-1, 1, 4) * half_widths
         self._k = 0
-        return self._observe(), self._info(float(in_band(self._pole.state)))
+        return self._observe(), self._info(float(self._kind.in_band(self._pole.state)))
 
     def step(
         self, action: NDArray[np.float32]
@@ -107,9 +105,8 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         steps = min(self._repeat, self._protocol.steps - self._k) or 1
         for _ in range(steps):
             state = self._pole.state
-            score += float(in_band(state))
-            cost += float(stage_cost(state, np.float64(force_n), kind.state_weights,
-                                     kind.force_weight))  # fmt: skip
+            score += float(kind.in_band(state))
+            cost += float(kind.cost(state, np.float64(force_n)))
             self._pole.step(force_n)
             moved = self._pole.state + self.np_random.standard_normal(4) * self._noise
             self._pole.state = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)

@@ -11,7 +11,7 @@ import typer
 
 from hjepa_cli import completion
 from hjepa_cli.checks import METHODS, SCHEDULERS
-from hjepa_cli.settings import PRESETS
+from hjepa_cli.settings import PLANTS, PRESETS
 
 FILES, DATA, MODEL, LOOP, RADIO = "Files", "Data", "Model", "Closed loop", "Radio cell"
 SETTINGS, SCREEN = "Settings", "Screen"
@@ -571,7 +571,7 @@ Config = Annotated[
 ]
 PlantName = Annotated[
     str | None,
-    _one_of(SETTINGS, "--plant", "Cart-pole to work with.", "desktop", "gym"),
+    _one_of(SETTINGS, "--plant", "What to control.", *PLANTS),
 ]
 Seed = Annotated[int | None, _count(SETTINGS, "--seed", "Seed of everything random.", minimum=0)]
 SettingPrefix = Annotated[

@@ -16,12 +16,17 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+from hjepa_cli import systems
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
 
 T = typing.TypeVar("T")
 
 CONFIG_LIMIT_BYTES = 2**20
-PRESETS = ("default", "paper", "gym", "smoke")
+_SHIPPED = sorted(
+    Path(entry.name).stem for entry in (resources.files("hjepa_cli") / "presets").iterdir()
+)
+PRESETS = ("default", *(name for name in _SHIPPED if name != "default"))
+PLANTS = ("desktop", "gym", *systems.NAMES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,13 +38,19 @@ class CollectSettings:
     clean_trajectories: int
     steps: int
     clean_steps: int
-    x_m: float  # initial states are uniform in ± these four
+    start: tuple[float, ...]  # initial states are uniform in ± these; none: a cart-pole's four
+    x_m: float
     x_dot_m_s: float
     theta_rad: float
     theta_dot_rad_s: float
     exploration_n: float
     exploration_hold_steps: int
     frames: Literal["rendered", "stored"]
+
+    @property
+    def half_widths(self) -> tuple[float, ...]:
+        """Of the initial states, one per state."""
+        return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +79,7 @@ class EncoderSettings:
     shift_px: int
     precision: Literal["auto", "bf16", "fp32"]
     gate: bool
+    gate_r2: tuple[float, ...]  # one per state; none: a cart-pole's four
     gate_r2_x: float
     gate_r2_x_dot: float
     gate_r2_theta: float
@@ -75,6 +87,12 @@ class EncoderSettings:
     gate_rank: float
     gate_sensitivity: float
     gate_actor_nrmse: float
+
+    @property
+    def least_r2(self) -> tuple[float, ...]:
+        """The gates of the linear probes, one per state."""
+        four = (self.gate_r2_x, self.gate_r2_x_dot, self.gate_r2_theta, self.gate_r2_theta_dot)
+        return self.gate_r2 or four
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,11 +143,13 @@ class ProtocolSettings:
     steps: int
     curve_devices: int
     bracket_devices: int
+    start: tuple[float, ...]  # as in [collect]
     x_m: float
     x_dot_m_s: float
     theta_rad: float
     theta_dot_rad_s: float
-    noise_x_dot_m_s: float  # standard deviation per control step
+    noise: tuple[float, ...]  # standard deviation per control step; none: a cart-pole's two
+    noise_x_dot_m_s: float
     noise_theta_dot_rad_s: float
     process_noise: Literal["velocity", "isotropic"]
     plant_spread: float
@@ -140,6 +160,16 @@ class ProtocolSettings:
     bracket: float
     horizon: int
     bootstrap: int
+
+    @property
+    def half_widths(self) -> tuple[float, ...]:
+        """Of the initial states, one per state."""
+        return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
+
+    @property
+    def velocity_noise(self) -> tuple[float, ...]:
+        """Standard deviation of what disturbs a step, one per state; 0 for positions."""
+        return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,7 +198,7 @@ class Settings:
     """Everything that defines a run besides the paths it reads and writes."""
 
     preset: str
-    plant: Literal["desktop", "gym"]
+    plant: str  # one of PLANTS
     seed: int
     device: Literal["auto", "cpu", "cuda"]
     methods: tuple[str, ...]
@@ -180,7 +210,11 @@ class Settings:
     radio: RadioSettings
 
     def as_dict(self) -> dict[str, Any]:
-        """Return nested plain data, ready for JSON (tuples become lists)."""
+        """Return nested plain data, ready for JSON (tuples become lists).
+
+        Empty lists are left out: they stand for values that say the same, and digests of settings
+        stay what they were before there were such lists.
+        """
         return typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
 
 
@@ -208,7 +242,10 @@ def load_settings(
             _override(values, changes, source)
         else:
             values = changes
-    return _build(Settings, values | {"preset": name}, "")
+    settings = _build(Settings, values | {"preset": name}, "")
+    if settings.plant not in PLANTS:
+        raise UsageError(f"plant = {settings.plant!r}; choose one of {', '.join(PLANTS)}")
+    return settings
 
 
 def origins(
@@ -320,7 +357,7 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: _plain(entry) for key, entry in value.items() if entry != ()}
     if isinstance(value, tuple | list):
         return [_plain(entry) for entry in value]
     return value

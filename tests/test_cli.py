@@ -27,7 +27,7 @@ from hjepa_cli.errors import (
     StorageError,
     UsageError,
 )
-from hjepa_cli.settings import load_settings
+from hjepa_cli.settings import PRESETS, load_settings
 
 MODULES = {
     "collect": "collect",
@@ -313,7 +313,7 @@ def test_quiet_prints_only_where_the_result_is(shell, stage):
 
 
 @pytest.mark.parametrize("command", MODULES)
-@pytest.mark.parametrize("preset", ["default", "paper", "gym", "smoke"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_dry_run_shows_a_plan_and_writes_nothing(shell, command, preset):
     with shell.untouched():
         outcome = shell(command, "--dry-run", "--preset", preset)

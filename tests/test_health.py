@@ -7,16 +7,18 @@ from scipy.linalg import lstsq
 
 from hjepa_cli.core import health
 
+NAMES = ("x", "x_dot", "theta", "theta_dot")
+
 
 def test_probe_of_a_linear_code_is_perfect_and_of_noise_is_zero() -> None:
     torch.manual_seed(0)
     states = torch.randn(3000, 4)
     code = states @ torch.randn(4, 32) + 5.0
-    r2 = health.probe_r2(code[:2000], states[:2000], code[2000:], states[2000:])
-    assert list(r2) == ["x", "x_dot", "theta", "theta_dot"]
+    r2 = health.probe_r2(code[:2000], states[:2000], code[2000:], states[2000:], NAMES)
+    assert tuple(r2) == NAMES
     assert all(value > 1.0 - 1e-6 for value in r2.values())
     noise = torch.randn(3000, 32)
-    blind = health.probe_r2(noise[:2000], states[:2000], noise[2000:], states[2000:])
+    blind = health.probe_r2(noise[:2000], states[:2000], noise[2000:], states[2000:], NAMES)
     assert all(-0.1 < value < 0.02 for value in blind.values())
 
 
@@ -29,14 +31,14 @@ def test_probe_against_scipy_least_squares() -> None:
     residual = states[400:] - np.c_[z[400:], np.ones(200)] @ weights
     expected = 1 - (residual**2).sum(0) / ((states[400:] - states[400:].mean(0)) ** 2).sum(0)
     tensors = [torch.from_numpy(a) for a in (z[:400], states[:400], z[400:], states[400:])]
-    measured = health.probe_r2(*tensors)
+    measured = health.probe_r2(*tensors, NAMES)
     np.testing.assert_allclose(list(measured.values()), expected, atol=1e-5)
 
 
 def test_collapsed_embeddings_are_survived_and_score_nothing() -> None:
     states = torch.randn(200, 4)
     constant = torch.ones(200, 16)
-    r2 = health.probe_r2(constant, states, constant, states)
+    r2 = health.probe_r2(constant, states, constant, states, NAMES)
     assert all(abs(value) < 0.05 for value in r2.values())
 
 
@@ -61,6 +63,16 @@ def test_action_sensitivity_of_a_linear_predictor() -> None:
     )
     # ±2 on each of three axes: ‖(4, 4, 4)‖ ÷ 4
     assert sensitivity == pytest.approx(3**0.5)
+
+
+def test_action_sensitivity_is_the_mean_over_the_forces() -> None:
+    z, z_next = torch.zeros(10, 2), torch.tensor([0.0, 4.0]).expand(10, 2)
+
+    def predict(state: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        return state + actions.sum(1) * torch.tensor([1.0, 3.0])  # each force moves its own axis
+
+    sensitivity = health.action_sensitivity(predict, z, z_next, steps=2, action_shape=(2,))
+    assert sensitivity == pytest.approx((4 + 12) / 2 / 4)
 
 
 def test_nrmse() -> None:

@@ -11,13 +11,13 @@ from hjepa_cli.core.metrics import (
     bootstrap_weights,
     control_error,
     first_crossing,
-    in_band,
     interval,
     mean_interval,
     ratio,
     stage_cost,
     window_means,
 )
+from hjepa_cli.core.plant import plant
 
 
 def test_score_band_includes_its_edges_and_ignores_velocities() -> None:
@@ -29,7 +29,7 @@ def test_score_band_includes_its_edges_and_ignores_velocities() -> None:
             [-0.05, 0.0, 2 * np.pi, 0.0],  # unwrapped: a full turn is not upright
         ]
     )
-    assert in_band(states).tolist() == [True, False, False, False]
+    assert plant("desktop").in_band(states).tolist() == [True, False, False, False]
 
 
 def test_stage_cost_is_the_quadratic_form_and_is_capped() -> None:
@@ -37,6 +37,8 @@ def test_stage_cost_is_the_quadratic_form_and_is_capped() -> None:
     state, force = np.array([0.1, -0.2, 0.3, -0.4]), 2.0
     by_hand = 20 * 0.01 + 0.5 * 0.04 + 20 * 0.09 + 0.05 * 0.16 + 0.05 * 4
     assert stage_cost(state, np.array(force), q, r) == pytest.approx(by_hand)
+    both = stage_cost(state, np.array([force, 3.0]), q, (r, 2.0))
+    assert both == pytest.approx(by_hand + 2.0 * 9)
     assert stage_cost(np.full((2, 3, 4), 50.0), np.zeros((2, 3)), q, r).tolist() == [[50.0] * 3] * 2
 
 

@@ -90,7 +90,7 @@ def test_a_missed_gate_stops_the_pipeline_and_leaves_no_checkpoint(workplace: Pa
 
 
 def test_gates_pass_exactly_at_their_thresholds() -> None:
-    options = load_settings().encoder
+    options = load_settings()
     health = {
         "probe_r2": {"x": 0.95, "x_dot": 0.90, "theta": 0.80, "theta_dot": 0.90},
         "effective_rank": 4.0,

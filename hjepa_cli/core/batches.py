@@ -15,7 +15,7 @@ class TrajectoryBatch:
 
     Attributes:
         frames: uint8 [B · F, 2, H, W, 3], (previous, current).
-        actions: applied actions ÷ force limit [B, F − 1, stride] between the frames.
+        actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
     """
 
     frames: Tensor
@@ -32,7 +32,7 @@ def window_indices(
 
 
 def stride_actions(actions: Tensor, steps: Tensor, stride: int) -> Tensor:
-    """Actions of every stride: [B, T] and frame steps [B, F] → [B, F − 1, stride].
+    """Actions of every stride: [B, T, *A] and frame steps [B, F] → [B, F − 1, stride, *A].
 
     Row f holds u_k … u_{k + stride − 1} for k = steps[f], the actions that lead from frame f to
     frame f + 1.
@@ -47,13 +47,14 @@ class FrameWindows:
 
     Args:
         frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.
-        actions: applied actions ÷ force limit [N, T].
+        actions: applied actions ÷ force limit [N, T, *A].
         window_frames, stride: F and the control steps between frames.
-        mirror: flip half of the windows left to right and negate their actions, which is exact
+        mirror: flip half of the windows left to right and their actions with them, which is exact
             physics and doubles the data.
         shift_px: move every window sideways by −shift_px … shift_px whole pixels, the same for all
             its frames. Exact physics as well, as long as nothing leaves the picture: the same
             motion elsewhere on the track.
+        mirrored_actions: what mirroring does to actions, a factor for each.
     """
 
     def __init__(
@@ -65,11 +66,13 @@ class FrameWindows:
         stride: int,
         mirror: bool,
         shift_px: int = 0,
+        mirrored_actions: float | tuple[float, ...] = -1.0,
     ) -> None:
         self.frames, self.actions = frames, actions
         self.steps = actions.shape[1]
         self.window_frames = min(window_frames, (self.steps - 1) // stride + 1)
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
+        self.mirrored_actions = torch.tensor(mirrored_actions)
 
     def draw(self, count: int, generator: np.random.Generator) -> TrajectoryBatch:
         """``count`` windows from trajectories drawn without replacement where they suffice."""
@@ -84,7 +87,7 @@ class FrameWindows:
         if self.mirror:
             flipped = torch.from_numpy(generator.random(count) < 0.5)
             pairs[flipped] = pairs[flipped].flip(-2)
-            actions = torch.where(flipped[:, None, None], -actions, actions)
+            actions[flipped] *= self.mirrored_actions
         if self.shift_px:
             shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)
             for window, shift_px in zip(pairs, shifts, strict=True):

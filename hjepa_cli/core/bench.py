@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.core import metrics
-from hjepa_cli.core.loop import Floats, Outcome, play
+from hjepa_cli.core.loop import Outcome, play
 from hjepa_cli.core.methods import Method
 from hjepa_cli.core.protocol import KINDS, Curves, Point, Reference, measure_curves
 from hjepa_cli.core.simulator import Runner, Tick, run_points
+from hjepa_cli.core.system import Floats
 from hjepa_cli.settings import ProtocolSettings
 
 EVERY_STEP = Point("gap", 1.0)
@@ -121,13 +122,13 @@ def control_errors(
 
     Args:
         method: how to drive.
-        states: rollouts [R, steps + 1, 4]; index 0 is the frame before k = 0.
-        teacher_n: the teacher's forces on them [R, steps].
+        states: rollouts [R, steps + 1, S]; index 0 is the frame before k = 0.
+        teacher_n: the teacher's forces on them [R, steps, *A].
         force_limit_n: half of the force range.
         horizon: last j; the packet at k = 0 is j = 0.
 
     Returns:
-        |ũ - u*| ÷ force range [R, horizon + 1].
+        |ũ - u*| ÷ force range [R, horizon + 1], the mean over a device's forces.
     """
     rollouts = len(states)
     controller = method.controller(rollouts)
@@ -144,7 +145,8 @@ def control_errors(
             axis=1,
         )
     forces_n = np.clip(forces_n, -force_limit_n, force_limit_n)
-    return metrics.control_error(forces_n, teacher_n[:, : horizon + 1], force_limit_n)
+    errors = metrics.control_error(forces_n, teacher_n[:, : horizon + 1], force_limit_n)
+    return np.asarray(errors.reshape(rollouts, horizon + 1, -1).mean(axis=-1))
 
 
 def control_entry(errors: Floats, replicates: int, seed: int) -> dict[str, Any]:

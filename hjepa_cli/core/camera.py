@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hjepa_cli.core import plant as plants
-from hjepa_cli.core.plant import Plant
+from hjepa_cli.core.plant import Plant, cart_pole
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -54,11 +53,11 @@ class Camera:
         plant: a plant or its name: fixes the window and the sizes of cart and pole.
 
     Raises:
-        UsageError: unknown plant.
+        UsageError: unknown plant, or no cart-pole.
     """
 
     def __init__(self, plant: Plant | str) -> None:
-        kind = plants.plant(plant) if isinstance(plant, str) else plant
+        kind = cart_pole(plant)
         self.plant = kind
         self.scale_px_m = WIDTH_PX / kind.window_m[0]
         self._cart_px = [_dyadic(size / 2 * self.scale_px_m) for size in kind.cart_size_m]
@@ -101,6 +100,16 @@ class Camera:
             "cart_rgb": list(CART_RGB),
             "pole_rgb": list(POLE_RGB),
         }
+
+    def sketch_px(self, state: ArrayLike) -> list[Floats]:
+        """The pole's axis and the cart's outline of a state ``[4]``, in pixels (column, row)."""
+        x_m, _, theta, _ = np.asarray(state, float)
+        pivot = np.array([WIDTH_PX / 2 + x_m * self.scale_px_m, PIVOT_ROW_PX])
+        length_px = 2 * self.plant.half_length_m * self.scale_px_m
+        tip = pivot + length_px * np.array([np.sin(theta), -np.cos(theta)])
+        half = np.array(self.plant.cart_size_m) / 2 * self.scale_px_m
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+        return [np.stack([pivot, tip]), pivot + corners * half]
 
     def _draw(self, pixels: NDArray[Any], first: int, states: Floats) -> None:
         """Draw a chunk of frames: each cart, then the band around its pole, which may cover it."""

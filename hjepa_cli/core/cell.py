@@ -66,7 +66,7 @@ class Cell:
         noise: ``"fixed"`` or ``"scaled"``; only ``equal`` looks at it.
         bandwidth_hz: W.
         slot_s: τ_o, one control step.
-        limit_bits_per_s: λ/ln 2, what stabilising one plant takes at least.
+        limit_bits_per_s: λ/ln 2, what stabilising one plant takes at least; 0 if it is stable.
     """
 
     law: Law
@@ -97,7 +97,8 @@ class Cell:
         row["devices_ci95"] = [self._devices(end, need.payload_bits, snr_db) for end in ends]
         if need.packets_per_slot is not None:
             row["bits_per_s"] = need.payload_bits * need.packets_per_slot / self.slot_s
-            row["ratio_to_limit"] = row["bits_per_s"] / self.limit_bits_per_s
+            if self.limit_bits_per_s > 0:
+                row["ratio_to_limit"] = row["bits_per_s"] / self.limit_bits_per_s
         if row["devices"] == 0:
             row["reason"] = self._why_nobody(need.tolerance, need.payload_bits, snr_db)
         return row

@@ -12,7 +12,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hjepa_cli.core.controllers import Bools
 from hjepa_cli.core.growth import Growth, conformal_growth
 from hjepa_cli.core.loop import (
     STATE_LIMIT,
@@ -22,13 +21,11 @@ from hjepa_cli.core.loop import (
     noise_per_step,
 )
 from hjepa_cli.core.methods import Method
-from hjepa_cli.core.metrics import control_error, in_band, stage_cost
-from hjepa_cli.core.plant import CartPoles, Plant
+from hjepa_cli.core.metrics import control_error
+from hjepa_cli.core.system import Bools, Floats, System
 from hjepa_cli.core.uplink import Access, Uplink
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.settings import ProtocolSettings
-
-Floats = NDArray[np.float64]
 
 CHUNK_STEPS = 256
 
@@ -37,7 +34,7 @@ class ForesightedController(Controller, Protocol):
     """A controller that can say what it will play if nothing arrives."""
 
     def outlook(self) -> Floats:
-        """Forces of the coming step [n]."""
+        """Forces of the coming step [n, *A]."""
         ...
 
 
@@ -60,7 +57,7 @@ class CellOutcome:
 
 
 def simulate_cell(
-    plant: Plant,
+    plant: System,
     protocol: ProtocolSettings,
     seed: int,
     devices: int,
@@ -98,7 +95,7 @@ def simulate_cell(
 
 
 def measure_growth(
-    plant: Plant,
+    plant: System,
     protocol: ProtocolSettings,
     seed: int,
     method: Method,
@@ -136,14 +133,14 @@ class World:
         score, cost: sums over the steps so far [N].
     """
 
-    def __init__(self, plant: Plant, protocol: ProtocolSettings, seed: int, devices: int) -> None:
+    def __init__(self, plant: System, protocol: ProtocolSettings, seed: int, devices: int) -> None:
         initial, mass_scale, self._noise = streamed_draws(protocol, devices, seed)
         self._plant = plant
-        self._poles = CartPoles(plant, devices, mass_scale=mass_scale)
-        self._poles.states = initial
+        self._plants = plant.simulation(devices, mass_scale=mass_scale)
+        self._plants.states = initial
         self._previous = initial
-        self._poles.step(np.zeros(devices))  # the camera needs the frame before k = 0
-        self._states = self._poles.states
+        self._plants.step(plant.no_force(devices))  # the camera needs the frame before k = 0
+        self._states = self._plants.states
         self.score, self.cost = np.zeros(devices), np.zeros(devices)
 
     def sense(self, sensor: Sensor, devices: Bools) -> Any:
@@ -158,14 +155,12 @@ class World:
             raise NumericalError("the controller's force is not finite")
         limit_n = self._plant.force_limit_n
         forces_n = np.clip(forces_n, -limit_n, limit_n)
-        self.score += in_band(self._states)
-        self.cost += stage_cost(
-            self._states, forces_n, self._plant.state_weights, self._plant.force_weight
-        )
+        self.score += self._plant.in_band(self._states)
+        self.cost += self._plant.cost(self._states, forces_n)
         self._previous = self._states
-        self._poles.step(forces_n)
-        moved = self._poles.states + next(self._noise)
-        self._poles.states = self._states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
+        self._plants.step(forces_n)
+        moved = self._plants.states + next(self._noise)
+        self._plants.states = self._states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
 
 
 def streamed_draws(
@@ -174,7 +169,7 @@ def streamed_draws(
     """The draws of :class:`~hjepa_cli.core.loop.Draws` without keeping them.
 
     Returns:
-        Initial states [N, 4], mass factors [N, 2] and the noise of one step after the other [N, 4].
+        Initial states [N, S], mass factors [N, 2] and the noise of one step after the other [N, S].
     """
     drawn = [device_draws(protocol, seed, device) for device in range(devices)]
     initial = np.stack([draw[0] for draw in drawn])
@@ -183,7 +178,7 @@ def streamed_draws(
     def noise() -> Iterator[Floats]:
         streams, scale = [draw[3] for draw in drawn], noise_per_step(protocol)
         while True:
-            chunk = [stream.standard_normal((CHUNK_STEPS, 4)) for stream in streams]
+            chunk = [stream.standard_normal((CHUNK_STEPS, scale.size)) for stream in streams]
             yield from np.stack(chunk, axis=1) * scale
 
     return initial, mass_scale, noise()
@@ -206,4 +201,5 @@ def _innovation(
     packets = world.sense(method.sensor, devices)
     count = int(devices.sum())
     wanted_n = method.reactive(count).act(np.ones(count, dtype=bool), packets)
-    return control_error(planned_n[devices], wanted_n, force_limit_n)
+    error = control_error(planned_n[devices], wanted_n, force_limit_n)
+    return np.asarray(error.reshape(count, -1).mean(axis=1))  # over the forces of a device

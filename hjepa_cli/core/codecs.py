@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.checks import parse_payload
-from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.encoder import normalise
 from hjepa_cli.core.payload import payload_bits, quantise
 from hjepa_cli.core.plant import plant
@@ -162,11 +161,12 @@ def fit_pca(z: Tensor, components: int, bits_per_value: int) -> PrincipalCompone
 def _typical_embeddings(model: "Model", settings: Settings) -> Tensor:
     """What the model sees on training trajectories of the settings' seed: embeddings [n, D]."""
     states = generate(settings, "train").states
-    pairs = np.stack([states[:, :-1], states[:, 1:]], axis=2).reshape(-1, 2, 4)
+    count = states.shape[2]
+    pairs = np.stack([states[:, :-1], states[:, 1:]], axis=2).reshape(-1, 2, count)
     pairs = pairs[:: max(1, len(pairs) // FIT_EMBEDDINGS)]
-    camera = Camera(plant(model.plant_name))
+    camera = plant(model.plant_name).camera()
     parts = []
     for start in range(0, len(pairs), 256):
-        frames = camera.render(pairs[start : start + 256].reshape(-1, 4).astype(float))
+        frames = camera.render(pairs[start : start + 256].reshape(-1, count).astype(float))
         parts.append(model.encode(frames.reshape(-1, 2, *frames.shape[1:])))
     return torch.cat(parts)

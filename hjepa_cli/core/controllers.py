@@ -9,11 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from hjepa_cli.core.system import Bools, Floats
 
 
 class Planner(Protocol):
@@ -25,7 +23,7 @@ class Planner(Protocol):
         ...
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Embeddings [n, D] → forces_n [n, stride], next embeddings [n, D]."""
+        """Embeddings [n, D] → forces_n [n, stride, *A], next embeddings [n, D]."""
         ...
 
 
@@ -35,18 +33,21 @@ class StrideController:
     Args:
         planner: see :class:`Planner`.
         devices: n.
+        action_shape: A, of the plant.
     """
 
-    def __init__(self, planner: Planner, devices: int) -> None:
+    def __init__(
+        self, planner: Planner, devices: int, *, action_shape: tuple[int, ...] = ()
+    ) -> None:
         self._planner = planner
-        self._forces_n = torch.zeros(devices, planner.stride)
+        self._forces_n = torch.zeros(devices, planner.stride, *action_shape)
         self._anchors = torch.zeros(devices, 0)  # takes its width from the first packets
         self._starts = self._anchors
         self._phase = np.full(devices, planner.stride)
 
     @torch.inference_mode()
     def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
-        """Forces of one step [n]; packets are embeddings [delivered.sum(), D].
+        """Forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
 
         The first call must deliver to every device.
         """
@@ -61,7 +62,7 @@ class StrideController:
 
     @torch.inference_mode()
     def outlook(self) -> Floats:
-        """Forces of the coming step [n] as they will be without a packet; from the second step on.
+        """Forces [n, *A] of the coming step if no packet comes; from the second step on.
 
         ``act`` then plans only for those who do get a packet.
         """
@@ -95,18 +96,26 @@ class LastForce:
     With the teacher as actor and a packet at every step this is the optimal controller.
 
     Args:
-        actor: packets [m, ...] → forces_n [m].
+        actor: packets [m, ...] → forces_n [m, *A].
         devices: n.
         keep: hold the last force between packets; ``False`` applies 0 N.
+        action_shape: A, of the plant.
     """
 
-    def __init__(self, actor: Callable[[Any], Any], devices: int, *, keep: bool) -> None:
+    def __init__(
+        self,
+        actor: Callable[[Any], Any],
+        devices: int,
+        *,
+        keep: bool,
+        action_shape: tuple[int, ...] = (),
+    ) -> None:
         self._actor, self._keep = actor, keep
-        self._forces_n = np.zeros(devices)
+        self._forces_n = np.zeros((devices, *action_shape))
 
     @torch.inference_mode()
     def act(self, delivered: Bools, packets: Any) -> Floats:
-        """Forces of one step [n]."""
+        """Forces of one step [n, *A]."""
         if not self._keep:
             self._forces_n[:] = 0.0
         if packets is not None:
@@ -116,7 +125,7 @@ class LastForce:
         return self._forces_n.copy()
 
     def outlook(self) -> Floats:
-        """Forces of the coming step [n] as they will be without a packet."""
+        """Forces [n, *A] of the coming step if no packet comes."""
         return self._forces_n.copy() if self._keep else np.zeros_like(self._forces_n)
 
 
@@ -127,10 +136,11 @@ class Oracle:
     masses.
 
     Args:
-        actor: states [m, 4] → forces_n [m], the teacher.
-        advance: one control step, states [n, 4] and applied forces_n [n] → states [n, 4].
+        actor: states [m, S] → forces_n [m, *A], the teacher.
+        advance: one control step, states [n, S] and applied forces_n [n, *A] → states [n, S].
         force_limit_n: the actuator clips here, and the oracle knows.
         devices: n.
+        states: S.
     """
 
     def __init__(
@@ -139,12 +149,14 @@ class Oracle:
         advance: Callable[[Floats, Floats], Floats],
         force_limit_n: float,
         devices: int,
+        *,
+        states: int = 4,
     ) -> None:
         self._actor, self._advance, self._limit_n = actor, advance, force_limit_n
-        self._states = np.zeros((devices, 4))
+        self._states = np.zeros((devices, states))
 
     def act(self, delivered: Bools, packets: Floats | None) -> Floats:
-        """Forces of one step [n]; packets are true states [delivered.sum(), 4]."""
+        """Forces of one step [n, *A]; packets are true states [delivered.sum(), S]."""
         if packets is not None:
             self._states[delivered] = packets
         forces_n = np.clip(self._actor(self._states), -self._limit_n, self._limit_n)
@@ -153,5 +165,5 @@ class Oracle:
         return forces_n
 
     def outlook(self) -> Floats:
-        """Forces of the coming step [n] as they will be without a packet."""
+        """Forces [n, *A] of the coming step if no packet comes."""
         return np.clip(self._actor(self._states), -self._limit_n, self._limit_n)

@@ -4,31 +4,35 @@ All functions take plain float tensors; nothing here trains the encoder (docs/me
 healthy ranges).
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-STATE_NAMES = ("x", "x_dot", "theta", "theta_dot")
-
 
 def probe_r2(
-    train_z: Tensor, train_states: Tensor, test_z: Tensor, test_states: Tensor
+    train_z: Tensor,
+    train_states: Tensor,
+    test_z: Tensor,
+    test_states: Tensor,
+    names: Sequence[str],
 ) -> dict[str, float]:
     """Held-out R² of a linear least-squares probe from embeddings to each state.
 
     Args:
         train_z, test_z: embeddings [N, D] and [N', D].
-        train_states, test_states: [N, 4] and [N', 4], order :data:`STATE_NAMES`.
+        train_states, test_states: [N, S] and [N', S].
+        names: of the S states.
     """
     truth = test_states.double()
     residual = truth - read_probe(fit_probe(train_z, train_states), test_z)
     r2 = 1.0 - residual.square().sum(0) / (truth - truth.mean(0)).square().sum(0)
-    return dict(zip(STATE_NAMES, r2.tolist(), strict=True))
+    return dict(zip(names, r2.tolist(), strict=True))
 
 
 def fit_probe(z: Tensor, states: Tensor) -> Tensor:
-    """Linear least squares from embeddings [N, D] to states [N, 4]: weights [D + 1, 4], float64."""
+    """Linear least squares from embeddings [N, D] to states [N, S]: weights [D + 1, S], float64."""
     design = _with_intercept(z)
     # A tiny ridge keeps collapsed embeddings solvable; 1e-6 of the mean square moves no healthy R².
     gram = design.T @ design
@@ -38,7 +42,7 @@ def fit_probe(z: Tensor, states: Tensor) -> Tensor:
 
 
 def read_probe(weights: Tensor, z: Tensor) -> Tensor:
-    """States [N, 4] that a probe reads from embeddings [N, D]."""
+    """States [N, S] that a probe reads from embeddings [N, D]."""
     return _with_intercept(z) @ weights
 
 
@@ -50,11 +54,21 @@ def effective_rank(z: Tensor) -> float:
 
 
 def action_sensitivity(
-    predict: Callable[[Tensor, Tensor], Tensor], z: Tensor, z_next: Tensor, steps: int
+    predict: Callable[[Tensor, Tensor], Tensor],
+    z: Tensor,
+    z_next: Tensor,
+    steps: int,
+    action_shape: tuple[int, ...] = (),
 ) -> float:
-    """mean ‖P(z, +u_max) − P(z, −u_max)‖ ÷ mean ‖z_{k+h} − z_k‖ over embeddings [N, D]."""
-    full = torch.ones(len(z), steps, dtype=z.dtype)
-    spread = (predict(z, full) - predict(z, -full)).norm(dim=-1).mean()
+    """mean ‖P(z, +u_max) − P(z, −u_max)‖ ÷ mean ‖z_{k+h} − z_k‖ over embeddings [N, D].
+
+    Where several forces drive a device, the mean over them, one at a time.
+    """
+    spreads = []
+    for force in torch.eye(math.prod(action_shape), dtype=z.dtype):
+        full = force.reshape(1, 1, *action_shape).expand(len(z), steps, *action_shape)
+        spreads.append((predict(z, full) - predict(z, -full)).norm(dim=-1).mean())
+    spread = torch.stack(spreads).mean()
     return float(spread / (z_next - z).norm(dim=-1).mean().clamp_min(1e-12))
 
 

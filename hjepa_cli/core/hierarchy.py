@@ -2,7 +2,7 @@
 
 Notation: a packet at step k restarts all grids at k. Coarse anchors lie at a = k, k + h, …; the
 medium level fills a + m, a + 2m, … inside each gap, the low level l, 2l, … inside each m-step.
-Actions are in units of the force limit everywhere in this file.
+Actions are in units of the force limit everywhere in this file; *A is their shape at one step.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ def rollout_loss(
         predictor: one stride per call.
         z: embeddings the rollouts start from [B, F, D], frames one stride apart.
         targets: embeddings to reach [B, F, D].
-        actions: [B, F − 1, steps], ``actions[:, f]`` lead from frame f to f + 1.
+        actions: [B, F − 1, steps, *A], ``actions[:, f]`` lead from frame f to f + 1.
         starts: ascending frame indices [S] to start from, the same for all B.
         horizon: strides to roll out; a start stops early where the window ends.
 
@@ -77,7 +77,7 @@ def rollout_loss(
 
 
 def rollout(predictor: Step, z: Tensor, actions: Tensor) -> Tensor:
-    """Autoregressive prediction: z [N, D], actions [N, S, steps] → [N, S + 1, D] with z first."""
+    """Autoregressive prediction: z [N, D], actions [N, S, steps, *A] → [N, S + 1, D], z first."""
     states = [z]
     for stride in range(actions.shape[1]):
         states.append(predictor(states[-1], actions[:, stride]))
@@ -90,7 +90,7 @@ def fill_gap(predictor: Step, left: Tensor, right: Tensor, actions: Tensor) -> T
     Args:
         predictor: the finer level's step.
         left, right: embeddings [N, D] at both ends of the gap.
-        actions: [N, C, steps], one row per sub-stride.
+        actions: [N, C, steps, *A], one row per sub-stride.
 
     Returns:
         Embeddings [N, C + 1, D] on the finer grid, both ends included.
@@ -121,14 +121,14 @@ def plan_stride(
     and the next stride starts there.
 
     Args:
-        act: embeddings [N, D] → actions [N].
+        act: embeddings [N, D] → actions [N, *A].
         coarse, medium, low: P^H, P^M, P^L.
         z: anchor embeddings [N, D].
         strides: (h, m, l).
         recompute_anchor: ``False`` keeps the first coarse prediction (the paper's literal reading).
 
     Returns:
-        Actions [N, h]; embeddings [N, h / l, D] on the finest grid they were taken at;
+        Actions [N, h, *A]; embeddings [N, h / l, D] on the finest grid they were taken at;
         the next anchor [N, D].
     """
     h, m, l = strides.h, strides.m, strides.l
@@ -154,21 +154,30 @@ def plan_stride(
 
 
 def hold(action: Tensor, steps: int) -> Tensor:
-    """Repeat actions [N] over ``steps`` control steps: [N, steps]."""
-    return action.unsqueeze(-1).expand(-1, steps)
+    """Repeat actions [N, *A] over ``steps`` control steps: [N, steps, *A]."""
+    return action.unsqueeze(1).expand(-1, steps, *action.shape[1:])
 
 
 def build_predictors(
-    strides: Strides, embedding: int, hidden: int, *, all_actions: bool, residual: bool
+    strides: Strides,
+    embedding: int,
+    hidden: int,
+    *,
+    all_actions: bool,
+    residual: bool,
+    forces: int = 1,
 ) -> dict[str, Predictor]:
-    """The three levels and the flat baseline ``ts-jepa-1``, keyed as in the checkpoint."""
+    """The three levels and the flat baseline ``ts-jepa-1``, keyed as in the checkpoint.
+
+    ``forces`` drive a device at every step.
+    """
     h, m, l = strides.h, strides.m, strides.l
 
     def level(steps: int, **anchoring: int) -> Predictor:
         return Predictor(
             embedding,
             hidden,
-            steps if all_actions else 1,
+            steps * forces if all_actions else forces,
             anchored=bool(anchoring),
             residual=residual,
             **anchoring,

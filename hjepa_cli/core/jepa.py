@@ -22,6 +22,7 @@ class Jepa:
         ema_decay: η.
         inverse_dynamics: weight of the inverse-dynamics loss; 0 leaves it out.
         rollout_strides: length of the training rollouts in strides.
+        forces: how many drive a device.
     """
 
     def __init__(
@@ -33,6 +34,7 @@ class Jepa:
         inverse_dynamics: float,
         rollout_strides: int,
         device: torch.device,
+        forces: int = 1,
     ) -> None:
         self.encoder, self.predictor = encoder.to(device), predictor.to(device)
         self.target = EmaTarget(encoder, ema_decay)
@@ -41,14 +43,14 @@ class Jepa:
         self.inverse: InverseDynamics | None = None
         if inverse_dynamics > 0.0:
             self.weights["inverse_dynamics"] = inverse_dynamics
-            self.inverse = InverseDynamics(encoder.head.out_features).to(device)
+            self.inverse = InverseDynamics(encoder.head.out_features, forces=forces).to(device)
         self.device = device
 
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
         """Named scalar loss terms of one batch, before weighting, under the names of ``weights``.
 
         Args:
-            batch: frames [B · F, 2, H, W, 3] and actions [B, F − 1, h], moved to the device here.
+            batch: frames [B · F, 2, H, W, 3] and actions [B, F − 1, h, *A], moved to the device.
         """
         frames, actions = batch.frames.to(self.device), batch.actions.to(self.device)
         windows, strides = actions.shape[0], actions.shape[1]
@@ -63,7 +65,7 @@ class Jepa:
         }
         if self.inverse is not None:
             terms["inverse_dynamics"] = self.inverse.loss(
-                z[:, :-1].flatten(0, 1), z[:, 1:].flatten(0, 1), actions.mean(-1).flatten()
+                z[:, :-1].flatten(0, 1), z[:, 1:].flatten(0, 1), actions.mean(2).flatten(0, 1)
             )
         return terms
 

@@ -15,7 +15,7 @@ from hjepa_cli.core.predictors import Predictor
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddedTrajectories:
-    """Frozen embeddings [N, T, D] of k = 0 … T − 1 and applied actions ÷ force limit [N, T]."""
+    """Frozen embeddings [N, T, D] of k = 0 … T − 1, applied actions ÷ force limit [N, T, *A]."""
 
     z: Tensor
     actions: Tensor
@@ -30,7 +30,7 @@ class EmbeddedTrajectories:
         """Random windows of ``frames`` embeddings, ``stride`` steps apart.
 
         Returns:
-            Trajectory indices [B, 1], steps k [B, F] and stride actions [B, F − 1, stride].
+            Trajectory indices [B, 1], steps k [B, F] and stride actions [B, F − 1, stride, *A].
         """
         total, length = self.z.shape[:2]
         chosen = torch.from_numpy(generator.choice(total, size=count, replace=count > total))
@@ -136,15 +136,15 @@ def high_gaps(
 
     Args:
         high: P^H; no gradient reaches it.
-        data: embeddings [N, T, D] and actions [N, T].
+        data: embeddings [N, T, D] and actions [N, T, *A].
         h: control steps per gap.
         horizon_steps: K_p, length of the rollouts in control steps.
         trajectories: rollouts.
         generator: of trajectories and starts.
 
     Returns:
-        Left and right ends [G, D] (z̃ at a and a + h), actions [G, h] of steps a … a + h − 1, and
-        where that is: (trajectory index [G], step a [G]).
+        Left and right ends [G, D] (z̃ at a and a + h), actions [G, h, *A] of steps a … a + h − 1,
+        and where that is: (trajectory index [G], step a [G]).
     """
     frames = min(max(horizon_steps // h, 1) + 1, data.window_frames(h))
     rows, k, actions = data.windows(trajectories, frames, h, generator)
@@ -169,5 +169,5 @@ def interior(
 
 
 def split(actions: Tensor, stride: int) -> Tensor:
-    """Actions of gaps [G, steps] → of their sub-strides [G, steps / stride, stride]."""
-    return actions.reshape(len(actions), -1, stride)
+    """Actions of gaps [G, steps, *A] → of their sub-strides [G, steps / stride, stride, *A]."""
+    return actions.reshape(len(actions), -1, stride, *actions.shape[2:])

@@ -16,16 +16,11 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hjepa_cli.core.metrics import in_band, stage_cost
-from hjepa_cli.core.plant import CartPoles, Plant
 from hjepa_cli.core.seeding import generator
+from hjepa_cli.core.system import Bools, Floats, System
 from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.settings import ProtocolSettings
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 LOOP_VERSION = 2  # raise it whenever a measured number changes: cached curves then expire
 STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
@@ -43,13 +38,13 @@ class Controller(Protocol):
             packets: what they carry [delivered.sum(), ...]; ``None`` when there are none.
 
         Returns:
-            Forces in newton [n].
+            Forces in newton [n, *A].
         """
         ...
 
 
 Sensor = Callable[[Floats, Floats], Any]
-"""The device side: previous states [m, 4], current states [m, 4] → packets [m, ...]."""
+"""The device side: previous states [m, S], current states [m, S] → packets [m, ...]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,10 +55,10 @@ class Draws:
     are, so the first 64 of 256 devices are the 64 devices.
 
     Attributes:
-        initial: states at k = -1 [N, 4].
-        noise: added to the states after each step [steps, N, 4].
+        initial: states at k = -1 [N, S].
+        noise: added to the states after each step [steps, N, S].
         delivery: uniform numbers; a packet gets through where they are below p [steps, N].
-        mass_scale: each device's cart and pole mass ÷ nominal [N, 2].
+        mass_scale: two masses of each device (a cart's and its pole's) ÷ nominal [N, 2].
     """
 
     initial: Floats
@@ -74,14 +69,15 @@ class Draws:
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
         """Draw for ``devices`` devices, all derived from ``seed``."""
-        initial = np.empty((devices, 4))
-        noise = np.empty((protocol.steps, devices, 4))
+        states = len(protocol.half_widths)
+        initial = np.empty((devices, states))
+        noise = np.empty((protocol.steps, devices, states))
         delivery = np.empty((protocol.steps, devices))
         mass_scale = np.empty((devices, 2))
         for device in range(devices):
             start, scale, uniforms, random = device_draws(protocol, seed, device)
             initial[device], mass_scale[device], delivery[:, device] = start, scale, uniforms
-            noise[:, device] = random.standard_normal((protocol.steps, 4))
+            noise[:, device] = random.standard_normal((protocol.steps, states))
         return cls(initial, noise * noise_per_step(protocol), delivery, mass_scale)
 
     @property
@@ -105,28 +101,25 @@ class Draws:
 def device_draws(
     protocol: ProtocolSettings, seed: int, device: int
 ) -> tuple[Floats, Floats, Floats, np.random.Generator]:
-    """One device's initial state [4], mass factors [2], delivery uniforms [steps], and its stream.
+    """One device's initial state [S], mass factors [2], delivery uniforms [steps], and its stream.
 
     The stream goes on with the standard normal noise of one step after the other.
     """
-    half_widths = np.array(
-        [protocol.x_m, protocol.x_dot_m_s, protocol.theta_rad, protocol.theta_dot_rad_s]
-    )
+    half_widths = np.array(protocol.half_widths)
     random = generator(seed, _DRAWS_KEY, device)
-    initial = random.uniform(-1, 1, 4) * half_widths
+    initial = random.uniform(-1, 1, half_widths.size) * half_widths
     mass_scale = 1 + protocol.plant_spread * random.uniform(-1, 1, 2)
     return initial, mass_scale, random.random(protocol.steps), random
 
 
 def noise_per_step(protocol: ProtocolSettings) -> Floats:
-    """Standard deviation of the process noise of one step in (x, ẋ, θ, θ̇).
+    """Standard deviation of the process noise of one step in each state [S].
 
-    ``velocity`` disturbs ẋ and θ̇, as forces would; ``isotropic`` has one standard deviation, that
-    of ẋ, in all four states (the paper's n_s, whose size it leaves open).
+    ``velocity`` disturbs velocities, as forces would; ``isotropic`` has one standard deviation,
+    that of the first velocity, in all states (the paper's n_s, whose size it leaves open).
     """
-    if protocol.process_noise == "isotropic":
-        return np.full(4, protocol.noise_x_dot_m_s)
-    return np.array([0.0, protocol.noise_x_dot_m_s, 0.0, protocol.noise_theta_dot_rad_s])
+    noise = np.array(protocol.velocity_noise)
+    return np.full_like(noise, noise[1]) if protocol.process_noise == "isotropic" else noise
 
 
 def every_step(steps: int, devices: int) -> Bools:
@@ -193,7 +186,7 @@ class Outcome:
 
 
 def simulate(
-    plant: Plant,
+    plant: System,
     draws: Draws,
     delivered: Bools,
     controller: Controller,
@@ -205,46 +198,47 @@ def simulate(
     """Run P × N closed loops at once.
 
     Args:
-        plant: the cart-pole; device masses are scaled by ``draws.mass_scale``.
+        plant: what is controlled; device masses are scaled by ``draws.mass_scale``.
         draws: initial states, noise and deliveries of N devices.
         delivered: link schedules [P, steps, N]; see :func:`gap_schedule`.
         controller: drives P · N devices, point by point; in its initial state.
         sensor: turns states into packets.
         tick: called after every step, for progress.
-        watch: called at every step with k, the states [P · N, 4] and the applied forces [P · N].
+        watch: called at every step with k, states [P · N, S] and applied forces [P · N, *A].
 
     Raises:
         NumericalError: the controller returned a force that is not finite.
     """
     points, steps, devices = delivered.shape
     assert (steps, devices) == draws.delivery.shape, (delivered.shape, draws.delivery.shape)
-    poles = CartPoles(plant, points * devices, mass_scale=np.tile(draws.mass_scale, (points, 1)))
-    poles.states = np.tile(draws.initial, (points, 1))
-    previous = poles.states
-    poles.step(np.zeros(points * devices))  # the camera needs the frame before k = 0
+    mass_scale = np.tile(draws.mass_scale, (points, 1))
+    world = plant.simulation(points * devices, mass_scale=mass_scale)
+    world.states = np.tile(draws.initial, (points, 1))
+    previous = world.states
+    world.step(plant.no_force(points * devices))  # the camera needs the frame before k = 0
     score, cost = np.zeros(points * devices), np.zeros(points * devices)
     for k in range(steps):
-        states = poles.states
+        states = world.states
         sent = delivered[:, k].reshape(-1)
         packets = sensor(previous[sent], states[sent]) if sent.any() else None
         forces = controller.act(sent, packets)
         if not np.isfinite(forces).all():
             raise NumericalError(f"the controller's force is not finite at step {k}")
         forces = np.clip(forces, -plant.force_limit_n, plant.force_limit_n)
-        score += in_band(states)
-        cost += stage_cost(states, forces, plant.state_weights, plant.force_weight)
+        score += plant.in_band(states)
+        cost += plant.cost(states, forces)
         watch(k, states, forces)
         previous = states
-        poles.step(forces)
-        moved = poles.states.reshape(points, devices, 4) + draws.noise[k]
-        poles.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT).reshape(-1, 4)
+        world.step(forces)
+        moved = world.states.reshape(points, devices, -1) + draws.noise[k]
+        world.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT).reshape(states.shape)
         tick()
     shape = (points, devices)
     return Outcome(score.reshape(shape) / steps, cost.reshape(shape) / steps)
 
 
 def play(controller: Controller, packets: Any, devices: int, steps: int) -> Floats:
-    """What a controller plays after a single packet at k = 0: forces [devices, steps]."""
+    """What a controller plays after a single packet at k = 0: forces [devices, steps, *A]."""
     arrives = np.ones(devices, dtype=bool)
     forces = [controller.act(arrives, packets)]
     forces += [controller.act(~arrives, None) for _ in range(steps - 1)]

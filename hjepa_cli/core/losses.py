@@ -25,10 +25,10 @@ class InverseDynamics(nn.Module):
     recipe from useless to better than supervised, see docs/LOG.md). Used in training only.
     """
 
-    def __init__(self, embedding: int, hidden: int = 256) -> None:
+    def __init__(self, embedding: int, hidden: int = 256, *, forces: int = 1) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(2 * embedding, hidden), nn.ReLU(), nn.Linear(hidden, 1)
+            nn.Linear(2 * embedding, hidden), nn.ReLU(), nn.Linear(hidden, forces)
         )
 
     def loss(self, z: Tensor, z_next: Tensor, action: Tensor) -> Tensor:
@@ -36,10 +36,10 @@ class InverseDynamics(nn.Module):
 
         Args:
             z, z_next: embeddings [N, D] a stride apart.
-            action: [N] mean applied action of the stride, in units of the force limit.
+            action: [N, *A] mean applied action of the stride, in units of the force limit.
 
         Returns:
             Scalar in (half the force limit)².
         """
-        predicted = self.layers(torch.cat([z, z_next], dim=-1)).squeeze(-1)
+        predicted = self.layers(torch.cat([z, z_next], dim=-1)).reshape(action.shape)
         return F.mse_loss(predicted, 2.0 * action)

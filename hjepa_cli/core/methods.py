@@ -15,13 +15,11 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.checks import TRUE_STATE
-from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.codecs import Codec, bits_of, build_codec
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
-from hjepa_cli.core.dynamics import rk4_step
-from hjepa_cli.core.loop import Controller, Floats, Sensor
-from hjepa_cli.core.plant import Plant, plant
-from hjepa_cli.core.policy import teacher
+from hjepa_cli.core.loop import Controller, Sensor
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.system import Floats, System
 from hjepa_cli.errors import UsageError
 from hjepa_cli.settings import Settings
 
@@ -69,7 +67,7 @@ def build_method(name: str, settings: Settings, model: "Model | None") -> Method
     return embedding_method(name, model, build_codec(payload, model, settings))
 
 
-def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Method:
+def true_state_method(name: str, kind: System, bits_per_transmission: int) -> Method:
     """One of :data:`~hjepa_cli.checks.TRUE_STATE`.
 
     Args:
@@ -78,14 +76,15 @@ def true_state_method(name: str, kind: Plant, bits_per_transmission: int) -> Met
         bits_per_transmission: counted as if embeddings were sent, so that device counts differ by
             control alone.
     """
-    act = teacher(kind)
-    reactive = functools.partial(LastForce, act, keep=True)
+    act = kind.teacher()
+    last_force = functools.partial(LastForce, act, action_shape=kind.action_shape)
+    reactive = functools.partial(last_force, keep=True)
     build: Callable[[int], Controller] = reactive
     if name == "oracle":
-        advance = functools.partial(_advance, kind)
-        build = functools.partial(Oracle, act, advance, kind.force_limit_n)
+        states = len(kind.state_names)
+        build = functools.partial(Oracle, act, kind.advance, kind.force_limit_n, states=states)
     elif name == "zero-true":
-        build = functools.partial(LastForce, act, keep=False)
+        build = functools.partial(last_force, keep=False)
     uses_link = name != "optimal"
     return Method(name, true_state, build, reactive, bits_per_transmission, "state", uses_link)
 
@@ -96,12 +95,14 @@ def embedding_method(name: str, model: "Model", codec: Codec) -> Method:
     Raises:
         UsageError: the model does not hold this method.
     """
-    reactive = functools.partial(LastForce, model.actor, keep=True)
+    last_force = functools.partial(LastForce, model.actor, action_shape=model.action_shape)
+    reactive = functools.partial(last_force, keep=True)
     build: Callable[[int], Controller] = reactive
     if name == "zero":
-        build = functools.partial(LastForce, model.actor, keep=False)
+        build = functools.partial(last_force, keep=False)
     elif name != "hold":
-        build = functools.partial(StrideController, model.planner(name))
+        planner, shape = model.planner(name), model.action_shape
+        build = functools.partial(StrideController, planner, action_shape=shape)
     sensor = embedding_sensor(model, codec)
     return Method(name, sensor, build, reactive, codec.bits, "embedding")
 
@@ -113,20 +114,16 @@ def true_state(previous: Floats, states: Floats) -> Floats:
 
 def embedding_sensor(model: "Model", codec: Codec) -> Callable[[Floats, Floats], Tensor]:
     """Sensor: render the last two frames, encode, send through the codec."""
-    camera = Camera(plant(model.plant_name))
+    camera = plant(model.plant_name).camera()
 
     def sense(previous: Floats, states: Floats) -> Tensor:
-        """States [m, 4] one step before and now → received embeddings [m, D]."""
+        """States [m, S] one step before and now → received embeddings [m, D]."""
         pairs = np.stack([previous, states], axis=1)
         received = []
         for start in range(0, len(pairs), SENSOR_BATCH):
-            frames = camera.render(pairs[start : start + SENSOR_BATCH].reshape(-1, 4))
+            frames = camera.render(pairs[start : start + SENSOR_BATCH].reshape(-1, states.shape[1]))
             z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
             received.append(codec.send(z))
         return torch.cat(received).to(model.device)
 
     return sense
-
-
-def _advance(kind: Plant, states: Floats, forces_n: Floats) -> Floats:
-    return rk4_step(kind, states, forces_n, kind.step_s)

@@ -14,31 +14,29 @@ from hjepa_cli.core.seeding import generator
 
 Floats = NDArray[np.float64]
 
-SCORE_X_M = 0.05
-SCORE_THETA_RAD = 0.05
 COST_CAP = 50.0
 TAILS = (0.025, 0.975)  # of a 95 % interval
 WINDOWS = ((1, 20), (21, 40), (41, 80), (81, 100))
 _BOOTSTRAP_KEY = 0xB007
 
 
-def in_band(states: Floats) -> NDArray[np.bool_]:
-    """Score of a step: |x| ≤ 0.05 m and |θ| ≤ 0.05 rad. States [..., 4] → bool [...]."""
-    return (np.abs(states[..., 0]) <= SCORE_X_M) & (np.abs(states[..., 2]) <= SCORE_THETA_RAD)
-
-
 def stage_cost(
-    states: Floats, forces_n: Floats, state_weights: Sequence[float], force_weight: float
+    states: Floats,
+    forces_n: Floats,
+    state_weights: Sequence[float],
+    force_weight: float | Sequence[float],
 ) -> Floats:
-    """Quadratic cost min(xᵀQx + R u², 50) of one step, so that one fallen pole stays finite.
+    """Quadratic cost min(xᵀQx + uᵀRu, 50) of one step, so that one lost device stays finite.
 
     Args:
-        states: [..., 4] in SI units.
-        forces_n: applied forces [...].
+        states: [..., S] in SI units.
+        forces_n: applied forces [...], or [..., m].
         state_weights: diagonal of Q, the teacher's.
-        force_weight: R, the teacher's.
+        force_weight: R, the teacher's, or its diagonal [m].
     """
-    cost = states**2 @ np.asarray(state_weights, dtype=np.float64) + force_weight * forces_n**2
+    squares = forces_n**2
+    effort = squares @ np.asarray(force_weight) if np.ndim(force_weight) else force_weight * squares
+    cost = states**2 @ np.asarray(state_weights, dtype=np.float64) + effort
     return np.minimum(cost, COST_CAP)
 
 

@@ -1,6 +1,7 @@
 """A trained model: encoder, predictors and actor in one object, as a checkpoint holds them."""
 
 import copy
+import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -31,10 +32,13 @@ CHOICES = {  # of an architecture; its other values are sizes
 PRECISIONS = ("auto", "bf16", "fp32")
 
 
-def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
+def build_modules(
+    architecture: Mapping[str, Any], action_shape: tuple[int, ...] = ()
+) -> nn.ModuleDict:
     """Instantiate the networks that ``architecture`` (checkpoint metadata) describes, untrained.
 
     ``kind`` "encoder" has Ψ and its companion P^H; "hierarchy" has Ψ, all levels and the actor.
+    ``action_shape`` is the plant's.
     """
     embedding, hidden = architecture["embedding"], architecture["hidden"]
     strides = Strides(architecture["h"], architecture["m"], architecture["l"])
@@ -47,12 +51,15 @@ def build_modules(architecture: Mapping[str, Any]) -> nn.ModuleDict:
         hidden,
         all_actions=architecture["stride_actions"] == "all",
         residual=architecture["residual"],
+        forces=math.prod(action_shape),
     )
     if architecture["kind"] == "encoder":
         modules["high"] = predictors["high"]
         return modules
     modules.update(predictors)
-    modules["actor"] = Actor(embedding, architecture["actor_hidden"], architecture["actor_dropout"])
+    modules["actor"] = Actor(
+        embedding, architecture["actor_hidden"], architecture["actor_dropout"], action_shape
+    )
     return modules
 
 
@@ -64,10 +71,11 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
     Raises:
         DataError: there is no such architecture, or the tensors do not fit it.
     """
-    architecture = check_metadata(checkpoint)["architecture"]
+    metadata = check_metadata(checkpoint)
+    architecture, action_shape = metadata["architecture"], plant(metadata["plant"]).action_shape
     try:
         with torch.device("meta"):
-            planned = build_modules(architecture).state_dict()
+            planned = build_modules(architecture, action_shape).state_dict()
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError, UsageError) as error:
         reason = str(error).partition("\n")[0]
         raise DataError(
@@ -78,7 +86,7 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
         for name, tensor in planned.items()
     }
     check_tensors(checkpoint, expected)
-    modules = build_modules(architecture)
+    modules = build_modules(architecture, action_shape)
     modules.load_state_dict(
         {name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()}
     )
@@ -149,7 +157,8 @@ class Model:
         self.metadata, self.digest = metadata, digest
         self.plant_name: str = metadata["plant"]
         self.precision: str = metadata["settings"]["encoder"]["precision"]
-        self.force_limit_n = plant(self.plant_name).force_limit_n
+        kind = plant(self.plant_name)
+        self.force_limit_n, self.action_shape = kind.force_limit_n, kind.action_shape
         self.strides = Strides(*(self.architecture[name] for name in ("h", "m", "l")))
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
@@ -191,7 +200,7 @@ class Model:
         )
 
     def actor(self, z: Tensor) -> Tensor:
-        """Embeddings [N, D] → forces_n [N], clipped to the force limit."""
+        """Embeddings [N, D] → forces_n [N, *A], clipped to the force limit."""
         with self.autocast():
             return self.force_limit_n * self._act(z)
 

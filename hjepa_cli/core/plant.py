@@ -14,24 +14,35 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import pymunk
 import pymunk.batch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hjepa_cli import systems
+from hjepa_cli.core.metrics import stage_cost
 from hjepa_cli.core.seeding import generator
+from hjepa_cli.core.system import Bools, Floats, System, Teacher, check_masses
 from hjepa_cli.errors import UsageError
+from hjepa_cli.settings import Settings
 
-Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    from hjepa_cli.core.camera import Camera
 
 TRACK_M = 1e4  # half length of the groove: out of reach
+SCORE_X_M = 0.05
+SCORE_THETA_RAD = 0.05
 START = np.array([0.03, 0.1, 0.08, 0.5])  # m, m/s, rad, rad/s: where a seeded CartPole starts
 
 
 @dataclasses.dataclass(frozen=True)
-class Plant:
+class Plant(System):
     """One kind of cart-pole with its teacher's weights and its camera's window."""
+
+    state_names: ClassVar[tuple[str, ...]] = ("x", "x_dot", "theta", "theta_dot")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "rad", "rad/s")
 
     name: str
     cart_mass_kg: float
@@ -55,10 +66,37 @@ class Plant:
         inertia = self.half_length_m * (4 / 3 - self.pole_mass_kg / total)
         return math.sqrt(self.gravity_m_s2 / inertia)
 
-    @property
-    def data_rate_limit_bits_per_s(self) -> float:
-        """λ/ln 2: no controller stabilises the pole from fewer bit/s (data-rate theorem)."""
-        return self.unstable_rate_rad_s / math.log(2)
+    def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> "CartPoles":
+        """See :class:`CartPoles`."""
+        return CartPoles(self, devices, mass_scale=mass_scale)
+
+    def in_band(self, states: Floats) -> Bools:
+        """|x| ≤ 0.05 m and |θ| ≤ 0.05 rad. States [..., 4] → bool [...]."""
+        return (np.abs(states[..., 0]) <= SCORE_X_M) & (np.abs(states[..., 2]) <= SCORE_THETA_RAD)
+
+    def cost(self, states: Floats, forces_n: Floats) -> Floats:
+        """See :func:`hjepa_cli.core.metrics.stage_cost`, with the teacher's weights."""
+        return stage_cost(states, forces_n, self.state_weights, self.force_weight)
+
+    # What knows the plant in turn is imported late.
+
+    def advance(self, states: Floats, forces_n: Floats) -> Floats:
+        """See :func:`hjepa_cli.core.dynamics.rk4_step`."""
+        from hjepa_cli.core.dynamics import rk4_step
+
+        return rk4_step(self, states, forces_n, self.step_s)
+
+    def teacher(self) -> Teacher:
+        """See :mod:`hjepa_cli.core.policy`."""
+        from hjepa_cli.core.policy import sdre
+
+        return sdre(self)
+
+    def camera(self) -> "Camera":
+        """See :class:`hjepa_cli.core.camera.Camera`."""
+        from hjepa_cli.core.camera import Camera
+
+        return Camera(self)
 
 
 PLANTS: Mapping[str, Plant] = MappingProxyType(
@@ -93,15 +131,52 @@ PLANTS: Mapping[str, Plant] = MappingProxyType(
 )
 
 
-def plant(name: str) -> Plant:
-    """Return the plant called ``name``.
+def plant(name: str) -> System:
+    """Return the plant called ``name``: a cart-pole, or a module of :mod:`hjepa_cli.systems`.
 
     Raises:
         UsageError: there is none, naming the valid choices.
     """
-    if name not in PLANTS:
-        raise UsageError(f"unknown plant '{name}'; choose one of {', '.join(PLANTS)}")
-    return PLANTS[name]
+    if name in PLANTS:
+        return PLANTS[name]
+    if name in systems.NAMES:
+        return systems.load(name)
+    choices = ", ".join([*PLANTS, *systems.NAMES])
+    raise UsageError(f"unknown plant '{name}'; choose one of {choices}")
+
+
+def plant_of(settings: Settings) -> System:
+    """Return the plant of the settings, after checking that they have one value per state.
+
+    Raises:
+        UsageError: they do not.
+    """
+    kind = plant(settings.plant)
+    for name, values in (
+        ("collect.start", settings.collect.half_widths),
+        ("encoder.gate_r2", settings.encoder.least_r2),
+        ("protocol.start", settings.protocol.half_widths),
+        ("protocol.noise", settings.protocol.velocity_noise),
+    ):
+        if len(values) != len(kind.state_names):
+            raise UsageError(
+                f"{name} has {len(values)} values; plant {kind.name} has {len(kind.state_names)} "
+                f"states: {', '.join(kind.state_names)}",
+                hint=f"--plant {kind.name}, or a --config FILE.toml that sets {name}",
+            )
+    return kind
+
+
+def cart_pole(which: Plant | str) -> Plant:
+    """Return a plant, given as such or by name, that is a cart-pole.
+
+    Raises:
+        UsageError: it is not.
+    """
+    kind = plant(which) if isinstance(which, str) else which
+    if not isinstance(kind, Plant):
+        raise UsageError(f"plant '{kind.name}' is no cart-pole; choose one of {', '.join(PLANTS)}")
+    return kind
 
 
 # What pymunk stores per body, in the order in which pymunk.batch reads and writes it.
@@ -145,13 +220,9 @@ class CartPoles:
     def __init__(
         self, plant: Plant | str, devices: int, *, mass_scale: ArrayLike | None = None
     ) -> None:
-        self.plant = _plant(plant)
-        if devices < 1:
-            raise UsageError(f"devices = {devices}; a simulation needs at least 1")
+        self.plant = cart_pole(plant)
+        scale = check_masses(devices, mass_scale)
         self.devices = devices
-        scale = np.ones((devices, 2)) if mass_scale is None else np.asarray(mass_scale, float)
-        if scale.shape != (devices, 2) or not (np.isfinite(scale) & (scale > 0)).all():
-            raise UsageError(f"mass_scale must be {devices} × 2 positive factors")
         self._substep_s = self.plant.step_s / self.plant.substeps
         self._space = self._build(scale)
         self._motion = _Writer(devices, _MOTION, 6)
@@ -261,7 +332,3 @@ class CartPole:
         if noise is not None:
             self.state = self.state + np.asarray(noise, float)
         return self.state
-
-
-def _plant(which: Plant | str) -> Plant:
-    return which if isinstance(which, Plant) else plant(which)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hjepa_cli.core import plant as plants
 from hjepa_cli.core.plant import Plant
+from hjepa_cli.core.system import System, Teacher
 
 Floats = NDArray[np.float64]
 
@@ -21,20 +22,20 @@ THETA_DOT_LIMIT_RAD_S = 25.0
 CELLS = (96, 100)  # of the gain table over theta and theta_dot; even, so that 0 is a node
 
 
-def teacher(preset: Plant | str) -> Callable[[ArrayLike], Floats]:
+def teacher(preset: System | str) -> Teacher:
     """Return the teacher of a plant.
 
     Args:
         preset: a plant or its name.
 
     Returns:
-        A function from states ``[..., 4]`` to forces ``[...]`` in N within ± ``force_limit_n``.
-        Beyond the table (|θ| > 1.2 rad, |θ̇| > 25 rad/s) the gains of its edge are used.
+        A function from states ``[..., S]`` to forces ``[..., *A]`` in N within ± ``force_limit_n``;
+        for a cart-pole :func:`sdre`, from ``[..., 4]`` to ``[...]``.
 
     Raises:
         UsageError: unknown plant.
     """
-    return _teacher(plants.plant(preset) if isinstance(preset, str) else preset)
+    return (plants.plant(preset) if isinstance(preset, str) else preset).teacher()
 
 
 def linear_gain(plant: Plant) -> Floats:
@@ -80,7 +81,11 @@ def state_dependent_form(plant: Plant, theta: Floats, theta_dot: Floats) -> tupl
 
 
 @functools.cache
-def _teacher(plant: Plant) -> Callable[[ArrayLike], Floats]:
+def sdre(plant: Plant) -> Teacher:
+    """The teacher of a cart-pole: states ``[..., 4]`` → forces ``[...]`` in N.
+
+    Beyond the table (|θ| > 1.2 rad, |θ̇| > 25 rad/s) the gains of its edge are used.
+    """
     cells = _bilinear_cells(_gain_table(plant))
     limits = np.array([THETA_LIMIT_RAD, THETA_DOT_LIMIT_RAD_S])
     per_cell = np.array(CELLS) / (2 * limits)

@@ -16,8 +16,8 @@ class Predictor(nn.Module):
     Args:
         embedding: D.
         hidden: width of the hidden layer.
-        actions: number of action inputs: the steps of the stride, or 1 where one held action
-            stands for all of them (the paper's literal reading).
+        actions: number of action inputs: the forces of every step of the stride, or those of one
+            where a held action stands for all of them (the paper's literal reading).
         anchored: the coarser prediction at the end of the gap is an input too (P^M, P^L).
         distances: how many sub-strides a gap has; more than two make the remaining distance vary,
             and then it is an input.
@@ -52,15 +52,15 @@ class Predictor(nn.Module):
 
         Args:
             z: embeddings [N, D] at the start of the stride.
-            actions: [N, steps] in units of the force limit; only the first ``self.actions`` of
-                them are read, so a held-action predictor takes the stride's first action.
+            actions: [N, steps, *A] in units of the force limit; only the first ``self.actions``
+                numbers are read, so a held-action predictor takes the stride's first action.
             anchor: coarser prediction [N, D] at the end of the gap, for anchored predictors.
             remaining: sub-strides left to the anchor, counted from z (1 would be the anchor).
 
         Returns:
             Embeddings [N, D] of length √D.
         """
-        inputs = [z, actions[..., : self.actions]]
+        inputs = [z, actions.flatten(1)[:, : self.actions]]
         start = z
         if self.anchored:
             assert anchor is not None, "an anchored predictor needs its anchor"

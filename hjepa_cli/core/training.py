@@ -138,7 +138,7 @@ def fit_actor(
 
     Args:
         z: embeddings [N, D].
-        actions: teacher's labels [N] in units of the force limit.
+        actions: teacher's labels [N, *A] in units of the force limit.
         epochs: passes over z, ``settings.epochs`` by default.
 
     Returns:
@@ -146,7 +146,8 @@ def fit_actor(
     """
     torch.manual_seed(seed)
     actions = actions.to(z.device)
-    actor = Actor(z.shape[1], settings.hidden, settings.dropout).to(z.device)
+    shape = tuple(actions.shape[1:])
+    actor = Actor(z.shape[1], settings.hidden, settings.dropout, shape).to(z.device)
     batches = max(len(z) // settings.batch, 1)
     total = batches * (epochs or settings.epochs)
     optimiser = Optimiser(

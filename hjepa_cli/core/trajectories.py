@@ -1,15 +1,12 @@
 """Trajectories for training: the teacher drives, exploration shows what a force does."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hjepa_cli.core.plant import CartPoles, plant
-from hjepa_cli.core.policy import teacher
+from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
-from hjepa_cli.settings import CollectSettings, Settings
+from hjepa_cli.core.system import Floats
+from hjepa_cli.settings import Settings
 from hjepa_cli.storage.datasets import Trajectories
-
-Floats = NDArray[np.float64]
 
 STREAM = 1  # this stage's branch of the seed tree
 SPLITS = ("train", "test", "clean")
@@ -47,34 +44,29 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     draws = [_draw(settings, split, i, steps) for i in rows]
     initial, exploration_n = (np.stack(parts) for parts in zip(*draws, strict=True))
 
-    force_n = teacher(kind)
-    poles = CartPoles(kind, count)
-    poles.states = initial
-    states = np.empty((count, steps + 1, 4))
-    applied_n, teacher_n = np.empty((count, steps)), np.empty((count, steps))
+    force_n, world = kind.teacher(), kind.simulation(count)
+    world.states = initial
+    states = np.empty((count, steps + 1, len(kind.state_names)))
+    applied_n, teacher_n = np.empty((2, count, steps, *kind.action_shape))
     states[:, 0] = initial
-    poles.step(np.zeros(count))
+    world.step(kind.no_force(count))
     for k in range(steps):
-        states[:, k + 1] = poles.states
+        states[:, k + 1] = world.states
         teacher_n[:, k] = force_n(states[:, k + 1])
         applied_n[:, k] = teacher_n[:, k] + exploration_n[:, k]
         applied_n[:, k] = applied_n[:, k].clip(-kind.force_limit_n, kind.force_limit_n)
-        poles.step(applied_n[:, k])
+        world.step(applied_n[:, k])
     return Trajectories(*(array.astype(np.float32) for array in (states, applied_n, teacher_n)))
 
 
 def _draw(settings: Settings, split: str, index: int, steps: int) -> tuple[Floats, Floats]:
-    """Draw one trajectory's initial state ``[4]`` and its piecewise constant pushes ``[steps]``."""
-    options = settings.collect
+    """One trajectory's initial state ``[S]`` and its piecewise constant pushes ``[steps, *A]``."""
+    options, shape = settings.collect, plant(settings.plant).action_shape
     random = generator(settings.seed, STREAM, SPLITS.index(split), index)
-    initial = random.uniform(-1, 1, 4) * _half_widths(options)
+    half_widths = np.array(options.half_widths)
+    initial = random.uniform(-1, 1, half_widths.size) * half_widths
     if split == "clean":
-        return initial, np.zeros(steps)
-    pushes_n = random.normal(
-        0.0, options.exploration_n, -(-steps // options.exploration_hold_steps)
-    )
-    return initial, np.repeat(pushes_n, options.exploration_hold_steps)[:steps]
-
-
-def _half_widths(options: CollectSettings) -> Floats:
-    return np.array([options.x_m, options.x_dot_m_s, options.theta_rad, options.theta_dot_rad_s])
+        return initial, np.zeros((steps, *shape))
+    hold = options.exploration_hold_steps
+    pushes_n = random.normal(0.0, options.exploration_n, (-(-steps // hold), *shape))
+    return initial, np.repeat(pushes_n, hold, axis=0)[:steps]

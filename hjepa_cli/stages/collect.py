@@ -7,6 +7,7 @@ report how fast that goes on this machine.
 
 import dataclasses
 import functools
+import math
 import shlex
 import time
 from pathlib import Path
@@ -14,9 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
+from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.core.payload import raw_frame_bits
+from hjepa_cli.core.plant import plant, plant_of
+from hjepa_cli.core.system import Camera
 from hjepa_cli.core.trajectories import generate, split_sizes
 from hjepa_cli.errors import Interrupted, StorageError, UsageError
 from hjepa_cli.interrupts import exit_code
@@ -59,10 +62,10 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     """
     check(settings)
     started = time.perf_counter()
-    camera = Camera(settings.plant)
+    camera = plant_of(settings).camera()
     definition = {
         "seed": settings.seed,
-        "collect": dataclasses.asdict(settings.collect) | {"plant": settings.plant},
+        "collect": settings.as_dict()["collect"] | {"plant": settings.plant},
     }
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
@@ -156,8 +159,8 @@ def make_shard(settings: Settings, directory: Path, shard: Shard) -> Described:
     """One unit of parallel work: decided by its arguments, written atomically, so repeatable."""
     made = generate(settings, shard.split, range(shard.start, shard.stop))
     if settings.collect.frames == "stored":
-        made = dataclasses.replace(made, frames=film(Camera(settings.plant), made))
-    return write_shard(directory, shard, made)
+        made = dataclasses.replace(made, frames=film(plant(settings.plant).camera(), made))
+    return write_shard(directory, shard, made, settings.plant)
 
 
 def film(camera: Camera, made: Trajectories) -> np.ndarray:
@@ -165,7 +168,7 @@ def film(camera: Camera, made: Trajectories) -> np.ndarray:
     frames = np.empty((*made.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     for start in range(0, len(made), TOGETHER):
         states = made.states[start : start + TOGETHER]
-        images = camera.render(states.reshape(-1, 4))
+        images = camera.render(states.reshape(-1, states.shape[-1]))
         frames[start : start + TOGETHER] = images.reshape(-1, *frames.shape[1:])
     return frames
 
@@ -181,9 +184,12 @@ def rate(camera: Camera, settings: Settings) -> float:
 
 def size_bytes(settings: Settings) -> int:
     """What the dataset takes on disk, without headers."""
-    frame_bytes = HEIGHT_PX * WIDTH_PX * 3 if settings.collect.frames == "stored" else 0
+    kind, frame_bytes = plant(settings.plant), 0
+    state_bytes, force_bytes = 4 * len(kind.state_names), 8 * math.prod(kind.action_shape)
+    if settings.collect.frames == "stored":
+        frame_bytes = HEIGHT_PX * WIDTH_PX * 3
     return sum(
-        count * ((steps + 1) * (16 + frame_bytes) + 8 * steps)
+        count * ((steps + 1) * (state_bytes + frame_bytes) + force_bytes * steps)
         for count, steps in split_sizes(settings).values()
     )
 

@@ -14,13 +14,13 @@ from typing import Any
 from hjepa_cli.checks import TRUE_STATE, check_methods
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
-from hjepa_cli.core.loop import Floats
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import WINDOWS
 from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant
+from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Runner, Simulator
+from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.core.workers import cluster_runner, open_workers, single_thread
 from hjepa_cli.errors import DataError, UsageError
@@ -222,6 +222,7 @@ def open_subject(
     settings: Settings, screen: Screen, checkpoint: str | None, dataset: Path | None
 ) -> Subject:
     """Load what is to be evaluated, and say which model it is where the user did not."""
+    plant_of(settings)
     path = zoo.resolve_model(checkpoint) if checkpoint else _default_model(settings, screen)
     model = Model.load(path, settings.device) if path else None
     if model and model.plant_name != settings.plant:

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from hjepa_cli import __version__
-from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import encode_frames
-from hjepa_cli.core.plant import plant
+from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.core.training import resolve_device
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
@@ -38,9 +37,9 @@ class RenderedSplit:
 
     Attributes:
         frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.
-        states: float32 [N, T, 4] at k = 0 … T − 1.
-        actions: applied actions ÷ force limit [N, T].
-        labels: teacher's actions ÷ force limit [N, T].
+        states: float32 [N, T, S] at k = 0 … T − 1.
+        actions: applied actions ÷ force limit [N, T, *A].
+        labels: teacher's actions ÷ force limit [N, T, *A].
     """
 
     frames: Tensor
@@ -63,12 +62,12 @@ class RenderedSplit:
         )
 
     def states_at(self, every: int) -> Tensor:
-        """States [N · K, 4] that go with :meth:`pairs`."""
+        """States [N · K, S] that go with :meth:`pairs`."""
         return self.states[:, ::every].flatten(0, 1)
 
     def labels_at(self, every: int) -> Tensor:
-        """Labels [N · K] that go with :meth:`pairs`."""
-        return self.labels[:, ::every].flatten()
+        """Labels [N · K, *A] that go with :meth:`pairs`."""
+        return self.labels[:, ::every].flatten(0, 1)
 
 
 def embed(
@@ -112,7 +111,9 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
     Raises:
         MissingInputError: there is none.
         DataError: it belongs to another plant.
+        UsageError: the settings do not fit their plant.
     """
+    plant_of(settings)
     path = path or find_newest_dataset(Path("data"), settings.plant)
     if path is None:
         raise MissingInputError(
@@ -124,16 +125,16 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
 
 def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> RenderedSplit:
     """Frames of one split, rendered now unless the dataset stores them."""
-    limit_n = plant(plant_name).force_limit_n
-    frames = trajectories.frames
+    kind = plant(plant_name)
+    limit_n, frames = kind.force_limit_n, trajectories.frames
     if frames is None:
-        camera = Camera(plant_name)
+        camera = kind.camera()
         count = len(trajectories)
         parts = []
         with screen.progress("render", count, "trajectories") as bar:
             for start in range(0, count, CHUNK):
                 chunk = trajectories.states[start : start + CHUNK]
-                images = camera.render(chunk.reshape(-1, 4))
+                images = camera.render(chunk.reshape(-1, chunk.shape[-1]))
                 parts.append(images.reshape(*chunk.shape[:2], *images.shape[1:]))
                 bar.advance(len(chunk))
         frames = np.concatenate(parts)

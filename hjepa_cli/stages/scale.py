@@ -233,7 +233,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
                 ),
                 row["bits_per_transmission"],
                 None if row["bits_per_s"] is None else f"{row['bits_per_s']:,.0f}",
-                None if row["bits_per_s"] is None else f"{row['ratio_to_limit']:,.0f}",
+                None if row["ratio_to_limit"] is None else f"{row['ratio_to_limit']:,.0f}",
             ]
             for method, (row, *_) in ranked
         ],

@@ -159,7 +159,8 @@ class ScheduledCell:
         reported = found.reports_per_slot * report_bits(counts[0])
         per_slot = (found.packets_per_slot * sent_bits + reported) / found.load
         row["bits_per_s"] = per_slot / self._plant.step_s
-        row["ratio_to_limit"] = row["bits_per_s"] / self._plant.data_rate_limit_bits_per_s
+        if (limit := self._plant.data_rate_limit_bits_per_s) > 0:
+            row["ratio_to_limit"] = row["bits_per_s"] / limit
         if row["devices"] == 0:
             row["reason"] = "fewer than one device"
         return row

@@ -18,12 +18,13 @@ from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.jepa import Jepa
 from hjepa_cli.core.model import build_modules, tensors_of
+from hjepa_cli.core.plant import plant
 from hjepa_cli.core.predictors import Predictor
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import EncoderSettings, Settings
+from hjepa_cli.settings import Settings
 from hjepa_cli.stages.inputs import (
     RenderedSplit,
     check_stride,
@@ -66,14 +67,14 @@ def run(
         screen.say(f"dataset {data.path} ({settings.plant}), run {record.directory}")
         train, test = (render(split, settings.plant, screen) for split in recorded.values())
         architecture = describe_architecture(settings)
-        modules = build_modules(architecture)
+        modules = build_modules(architecture, plant(settings.plant).action_shape)
         encoder, companion = modules["encoder"], modules["high"]
         assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
         train_jepa(encoder, companion, train, test, settings, record, progress, screen)
 
         screen.say("measuring health on all frames and fitting the probe actor")
         report = examine(encoder, companion, train, test, settings, every=1, epochs=None)
-        gates = judge(report, settings.encoder)
+        gates = judge(report, settings)
         accepted = all(gate["passed"] for gate in gates.values()) or not settings.encoder.gate
         path = record.path(MODEL_FILE if accepted else REJECTED_FILE)
         metadata = {
@@ -131,7 +132,7 @@ def train_jepa(
     screen: Screen,
 ) -> None:
     """The training loop; modules are trained in place and left in evaluation mode."""
-    options = settings.encoder
+    options, kind = settings.encoder, plant(settings.plant)
     device = resolve_device(settings.device)
     encoder.fit_standardisation(standardisation_sample(train.frames))
     jepa = Jepa(
@@ -141,6 +142,7 @@ def train_jepa(
         inverse_dynamics=options.inverse_dynamics,
         rollout_strides=max(options.rollout_steps // options.h, 1),
         device=device,
+        forces=math.prod(kind.action_shape),
     )
     optimiser = Optimiser(
         jepa.parameters(),
@@ -158,6 +160,7 @@ def train_jepa(
         stride=options.h,
         mirror=options.mirror,
         shift_px=options.shift_px,
+        mirrored_actions=kind.mirror,
     )
     stream = generator(settings.seed, STREAM)
     frames_per_epoch = train.actions.numel()
@@ -205,6 +208,7 @@ def examine(
     training is mirrored.
     """
     options, device = settings.encoder, resolve_device(settings.device)
+    kind = plant(settings.plant)
     encoder.eval()
 
     train_z, test_z = (embed(encoder, split, settings, every=every) for split in (train, test))
@@ -214,16 +218,18 @@ def examine(
     if epochs is None and options.mirror:
         mirrored = embed(encoder, train, settings, every=every, mirrored=True)
         fit_z = torch.cat([fit_z, mirrored.flatten(0, 1)])
-        fit_labels = torch.cat([fit_labels, -fit_labels])
+        fit_labels = torch.cat([fit_labels, torch.tensor(kind.mirror) * fit_labels])
     actor = fit_actor(fit_z, fit_labels, settings.actor, seed=settings.seed, epochs=epochs)
     ahead = options.h // every
     start, end = per_trajectory[:, :-ahead].flatten(0, 1), per_trajectory[:, ahead:].flatten(0, 1)
     with torch.no_grad():
-        sensitivity = health.action_sensitivity(companion.cpu().eval(), start, end, steps=options.h)
+        sensitivity = health.action_sensitivity(
+            companion.cpu().eval(), start, end, options.h, kind.action_shape
+        )
         error = health.nrmse(actor.act(test_z), test.labels_at(every))
     companion.to(device).train()
     return {
-        "probe_r2": health.probe_r2(train_z, train_states, test_z, test_states),
+        "probe_r2": health.probe_r2(train_z, train_states, test_z, test_states, kind.state_names),
         "effective_rank": health.effective_rank(test_z),
         "std": float(test_z.std(0).mean()),
         "action_sensitivity": sensitivity,
@@ -231,10 +237,11 @@ def examine(
     }
 
 
-def judge(report: dict[str, Any], options: EncoderSettings) -> dict[str, dict[str, Any]]:
+def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any]]:
     """Compare the health report with the stage gates."""
+    options, states = settings.encoder, plant(settings.plant).state_names
     lower_bounds = {
-        f"probe_r2_{name}": getattr(options, f"gate_r2_{name}") for name in health.STATE_NAMES
+        f"probe_r2_{name}": bound for name, bound in zip(states, options.least_r2, strict=True)
     }
     lower_bounds |= {
         "effective_rank": options.gate_rank,

@@ -81,7 +81,7 @@ def run(
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path}, encoder {source.path}, run {record.directory}")
         architecture = describe_architecture(source, settings)
-        modules = build_modules(architecture)
+        modules = build_modules(architecture, plant(settings.plant).action_shape)
         modules["encoder"].load_state_dict(trained["encoder"].state_dict())
         modules["encoder"].requires_grad_(False).eval()
         if source.metadata["architecture"]["h"] == strides.h:
@@ -94,7 +94,7 @@ def run(
             screen.say("fitting the semantic actor")
             actor = fit_actor(
                 torch.cat([data.z.flatten(0, 1) for data, _ in seen]),
-                torch.cat([labels.flatten() for _, labels in seen]),
+                torch.cat([labels.flatten(0, 1) for _, labels in seen]),
                 settings.actor,
                 seed=settings.seed,
             )
@@ -206,15 +206,17 @@ def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, A
 def embed_all(
     encoder: nn.Module, train: RenderedSplit, settings: Settings, screen: Screen
 ) -> list[tuple[EmbeddedTrajectories, Tensor]]:
-    """Frozen embeddings and labels [N, T] of the training frames; mirrored too where that is on."""
-    device = resolve_device(settings.device)
-    signs = (1.0, -1.0) if settings.encoder.mirror else (1.0,)
+    """Embeddings and labels [N, T, *A] of the training frames; mirrored too where that is on."""
+    device, mirror = resolve_device(settings.device), torch.tensor(plant(settings.plant).mirror)
+    views = (False, True) if settings.encoder.mirror else (False,)
     seen = []
-    with screen.progress("encode", len(signs) * len(train.frames), "trajectories") as bar:
-        for sign in signs:
-            z = embed(encoder, train, settings, mirrored=sign < 0, advance=bar.advance)
-            data = EmbeddedTrajectories(z.to(device), (sign * train.actions).to(device))
-            seen.append((data, sign * train.labels))
+    with screen.progress("encode", len(views) * len(train.frames), "trajectories") as bar:
+        for mirrored in views:
+            z = embed(encoder, train, settings, mirrored=mirrored, advance=bar.advance)
+            actions, labels = (
+                mirror * forces if mirrored else forces for forces in (train.actions, train.labels)
+            )
+            seen.append((EmbeddedTrajectories(z.to(device), actions.to(device)), labels))
     return seen
 
 
@@ -228,7 +230,9 @@ def examine(
     start, end = z[:, :-h].flatten(0, 1), z[:, h:].flatten(0, 1)
     return {
         "actor_nrmse": health.nrmse(actor.act(z), test.labels),
-        "action_sensitivity": health.action_sensitivity(high, start, end, steps=h),
+        "action_sensitivity": health.action_sensitivity(
+            high, start, end, h, plant(settings.plant).action_shape
+        ),
     }
 
 

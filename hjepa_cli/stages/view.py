@@ -14,17 +14,16 @@ import numpy as np
 import torch
 
 from hjepa_cli.core import health
-from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.capacity import equal_devices
 from hjepa_cli.core.channel import rayleigh_power_gains
 from hjepa_cli.core.codecs import bits_of
 from hjepa_cli.core.controllers import StrideController
 from hjepa_cli.core.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.metrics import in_band
 from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import Plant, plant
+from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
+from hjepa_cli.core.system import System
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
@@ -58,8 +57,8 @@ class Film:
 
     Attributes:
         method: its name.
-        states: true states [K, n, 4].
-        believed: states read from the controller's embedding [K, n, 4].
+        states: true states [K, n, S].
+        believed: states read from the controller's embedding [K, n, S].
         score: whether each step was inside the band [K, n].
     """
 
@@ -158,14 +157,14 @@ def run(
     probe = fit_probe(settings, subject.model, screen)
     films = [film(name, settings, subject.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.steps // 100, 1)
-    pictures = animation.Pictures(films, link, plant(settings.plant), every)
+    kind = plant(settings.plant)
+    pictures = animation.Pictures(films, link, kind, every)
     result = {
         "checkpoint": subject.path,
         "methods": {
             shot.method: {
                 "share_in_band": shot.score.mean(axis=0),
-                "belief_error_x_m": np.abs(shot.believed - shot.states)[..., 0].mean(),
-                "belief_error_theta_rad": np.abs(shot.believed - shot.states)[..., 2].mean(),
+                **belief_errors(shot, kind),
             }
             for shot in films
         },
@@ -180,6 +179,15 @@ def run(
         animation.write(pictures, out, fps, bar.advance)
     screen.say(f"{len(pictures)} pictures at {fps} per second: {out}")
     return result
+
+
+def belief_errors(shot: Film, kind: System) -> dict[str, float]:
+    """Mean distance between true and believed states: ``belief_error_x_m`` and so on."""
+    errors = np.abs(shot.believed - shot.states).mean(axis=(0, 1))
+    described = zip(kind.state_names, kind.state_units, errors.tolist(), strict=True)
+    return {
+        f"belief_error_{name}_{unit.replace('/', '_')}": error for name, unit, error in described
+    }
 
 
 def check_methods(methods: Sequence[str], model: Model) -> None:
@@ -232,13 +240,13 @@ def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
     """A linear probe from embeddings to states, on training trajectories made from the seed."""
     count = min(PROBE_TRAJECTORIES, settings.collect.trajectories)
     recorded = generate(settings, "train")[:count]
-    camera = Camera(settings.plant)
+    camera = plant(settings.plant).camera()
     embeddings, states = [], []
     with screen.progress("fit probe", count, "trajectories") as bar:
         for trajectory in recorded.states:
             now = np.arange(1, len(trajectory), PROBE_EVERY)
             pairs = trajectory[np.stack([now - 1, now], axis=1)]
-            frames = camera.render(pairs.reshape(-1, 4))
+            frames = camera.render(pairs.reshape(-1, pairs.shape[-1]))
             embeddings.append(model.encode(frames.reshape(-1, 2, *frames.shape[1:])))
             states.append(torch.from_numpy(trajectory[now]))
             bar.advance()
@@ -249,7 +257,7 @@ def film(
     name: str, settings: Settings, model: Model, link: Link, probe: torch.Tensor, screen: Screen
 ) -> Film:
     """Drive the devices with one method and keep every state and belief."""
-    kind: Plant = plant(settings.plant)
+    kind = plant(settings.plant)
     method = build_method(name, settings, model)
     steps, devices = link.delivered.shape
     believer = Believer(method.controller(devices), probe)
@@ -264,4 +272,4 @@ def film(
             tick=bar.advance,
             watch=lambda k, now, forces_n: states.append(now.copy()),
         )
-    return Film(name, np.stack(states), np.stack(believer.believed), in_band(np.stack(states)))
+    return Film(name, np.stack(states), np.stack(believer.believed), kind.in_band(np.stack(states)))

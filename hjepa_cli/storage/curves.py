@@ -67,12 +67,14 @@ class Digest:
         """
         values = settings.as_dict()
         source = values if dataset is None else dataset
+        collected = source["collect"]
+        start = collected.get("start", [])
         measured = {
             "plant": values["plant"],
             "seed": values["seed"],
             "protocol": values["protocol"],
             "embedding": values["encoder"]["embedding"],
-            "clean": [source["seed"], *(source["collect"][key] for key in _CLEAN)],
+            "clean": [source["seed"], *(collected[key] for key in _CLEAN), *start],
         }
         text = files.canonical_json(measured)
         return cls(checkpoint, hashlib.sha256(text.encode()).hexdigest())

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError
 from hjepa_cli.storage import files
 from hjepa_cli.storage import tensors as arrays
@@ -35,9 +36,10 @@ class Trajectories:
     The state at step k is ``states[:, k + 1]``.
 
     Args:
-        states: float32 [N, T + 1, 4]: x (m), x_dot (m/s), theta (rad), theta_dot (rad/s).
-        applied_n: float32 [N, T], the force applied at step k (N).
-        teacher_n: float32 [N, T], the teacher's force for the state at step k (N).
+        states: float32 [N, T + 1, S], the plant's states; of a cart-pole x (m), x_dot (m/s), theta
+            (rad), theta_dot (rad/s).
+        applied_n: float32 [N, T, *A], the force or forces applied at step k (N).
+        teacher_n: float32 [N, T, *A], the teacher's for the state at step k (N).
         frames: uint8 [N, T + 1, 64, 128, 3], or ``None`` if they are rendered on load.
     """
 
@@ -100,7 +102,7 @@ class Dataset:
                 hint="collect the dataset again: hjepa collect",
             )
         tensors, _ = arrays.unpack(data, path)
-        _check(tensors, shard["trajectories"], steps, self.frames == "stored", path)
+        _check(tensors, shard["trajectories"], steps, self.frames == "stored", path, self.plant)
         return tensors
 
 
@@ -131,9 +133,9 @@ def write_dataset(
     _remove_shards(directory)
     stored = any(split.frames is not None for split in splits.values())
     for name, split in splits.items():
-        _check(split.tensors(), len(split), split.steps, stored, directory / name)
+        _check(split.tensors(), len(split), split.steps, stored, directory / name, plant_name)
     done = [
-        write_shard(directory, shard, splits[shard.split][shard.start : shard.stop])
+        write_shard(directory, shard, splits[shard.split][shard.start : shard.stop], plant_name)
         for shard in cut({name: len(split) for name, split in splits.items()}, per_shard(stored))
     ]
     return write_manifest(
@@ -145,7 +147,9 @@ def write_dataset(
     )
 
 
-def write_shard(directory: Path, shard: Shard, trajectories: Trajectories) -> Described:
+def write_shard(
+    directory: Path, shard: Shard, trajectories: Trajectories, plant_name: str
+) -> Described:
     """Write one shard and return how the manifest will describe it.
 
     Raises:
@@ -154,7 +158,7 @@ def write_shard(directory: Path, shard: Shard, trajectories: Trajectories) -> De
     """
     stored = trajectories.frames is not None
     path = directory / shard.name
-    _check(trajectories.tensors(), len(trajectories), trajectories.steps, stored, path)
+    _check(trajectories.tensors(), len(trajectories), trajectories.steps, stored, path, plant_name)
     data = arrays.pack(trajectories.tensors())
     files.write_bytes(path, data)
     return {
@@ -284,13 +288,23 @@ def per_shard(stored: bool) -> int:
 
 
 def _check(
-    tensors: Mapping[str, np.ndarray], count: int, steps: int, stored: bool, where: Path
+    tensors: Mapping[str, np.ndarray],
+    count: int,
+    steps: int,
+    stored: bool,
+    where: Path,
+    plant_name: str,
 ) -> None:
     """Demand the shapes of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
+    try:
+        kind = plant(plant_name)
+    except UsageError as error:
+        raise DataError(f"{where}: {error.message}") from None
+    forces = (count, steps, *kind.action_shape)
     expected: dict[str, tuple[str, tuple[int, ...]]] = {
-        "states": ("float32", (count, steps + 1, 4)),
-        "applied_n": ("float32", (count, steps)),
-        "teacher_n": ("float32", (count, steps)),
+        "states": ("float32", (count, steps + 1, len(kind.state_names))),
+        "applied_n": ("float32", forces),
+        "teacher_n": ("float32", forces),
     }
     if stored:
         expected["frames"] = ("uint8", (count, steps + 1, *FRAME_SHAPE))

@@ -5,9 +5,9 @@ is the frame before k = 0, which moves on without force. So no frame is lost, an
 trajectory holds what was seen and the action that led from there to row j + 1:
 
 - ``pixels`` uint8 [rows, 64, 128, 3], the camera's RGB frames;
-- ``state`` float32 [rows, 4], x (m), x_dot (m/s), theta (rad), theta_dot (rad/s);
-- ``action`` float32 [rows, 1], the applied force ÷ the force limit, in [-1, 1];
-- ``teacher_action`` float32 [rows, 1], what the teacher would do there, on the same scale;
+- ``state`` float32 [rows, S], of a cart-pole x (m), x_dot (m/s), theta (rad), theta_dot (rad/s);
+- ``action`` float32 [rows, m], the m applied forces (a cart-pole's one) ÷ the limit, in [-1, 1];
+- ``teacher_action`` float32 [rows, m], what the teacher would do there, on the same scale;
 - ``ep_len`` int32 and ``ep_offset`` int64 [trajectories], rows of each and its first row.
 """
 
@@ -36,16 +36,16 @@ def columns(
 
     Args:
         split: N trajectories.
-        first_teacher_n: the teacher's force [N] at the frame before k = 0, which is not stored.
+        first_teacher_n: the teacher's forces [N, *A] before k = 0, which are not stored.
         force_limit_n: what actions are divided by.
     """
     count, rows = split.states.shape[:2]
-    applied_n = np.concatenate([np.zeros((count, 1)), split.applied_n], axis=1)
+    applied_n = np.concatenate([np.zeros_like(first_teacher_n)[:, None], split.applied_n], axis=1)
     teacher_n = np.concatenate([first_teacher_n[:, None], split.teacher_n], axis=1)
     return {
-        "state": split.states.reshape(-1, 4),
-        "action": (applied_n / force_limit_n).astype(np.float32).reshape(-1, 1),
-        "teacher_action": (teacher_n / force_limit_n).astype(np.float32).reshape(-1, 1),
+        "state": split.states.reshape(count * rows, -1),
+        "action": (applied_n / force_limit_n).astype(np.float32).reshape(count * rows, -1),
+        "teacher_action": (teacher_n / force_limit_n).astype(np.float32).reshape(count * rows, -1),
         "ep_len": np.full(count, rows, np.int32),
         "ep_offset": np.arange(count, dtype=np.int64) * rows,
     }
