@@ -135,7 +135,7 @@ def plan_train_hierarchy(
         command="train-hierarchy",
         reads=[_dataset(dataset, settings), _encoder(encoder, settings)],
         work=[
-            f"render and encode about {frames} frames and their mirror images",
+            f"render and encode about {frames} frames",
             f"train P^H, P^M, P^L (h, m, l = {options.h}, {options.m}, {options.l}), "
             f"ts-jepa-1 and the actor ({steps} steps)",
         ],

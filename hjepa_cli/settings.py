@@ -75,7 +75,7 @@ class EncoderSettings:
     gradient_clip: float
     ema_decay: float
     inverse_dynamics: float
-    mirror: bool
+    mirror: Literal["exact", "augment", "none"]
     shift_px: int
     precision: Literal["auto", "bf16", "fp32"]
     gate: bool

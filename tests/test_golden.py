@@ -59,8 +59,10 @@ def untrained() -> Model:
     torch.manual_seed(0)
     modules = build_modules(architecture)
     for name in ("high", "medium", "low", "flat"):  # they start as "nothing changes"
-        torch.nn.init.normal_(modules[name].output.weight, std=0.2)
-    torch.nn.init.normal_(modules["actor"].layers[-1].weight, std=1.0)
+        for parameter in modules[name].output.parameters():
+            torch.nn.init.normal_(parameter, std=0.2)
+    for parameter in modules["actor"].layers[-1].parameters():
+        torch.nn.init.normal_(parameter, std=1.0)
     metadata = {"architecture": architecture, "plant": "desktop", "settings": settings().as_dict()}
     return Model(modules, metadata, "", "cpu")
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from hjepa_cli.core.model import Model, load_modules
+from hjepa_cli.core.symmetry import reflect
 from hjepa_cli.errors import DataError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
@@ -46,12 +47,12 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def train(root: Path, out: str, **changes: object) -> Model:
+def train(root: Path, out: str, encoder: str = "encoder", **changes: object) -> Model:
     result = train_hierarchy.run(
         settings(**changes),
         QUIET,
         dataset=root / "data",
-        encoder=str(root / "encoder"),
+        encoder=str(root / encoder),
         out=root / out,
     )
     return Model.load(Path(result["checkpoint"]), "cpu")
@@ -191,7 +192,9 @@ def test_a_rejected_encoder_is_kept_apart_and_can_be_used(workplace: Path) -> No
     )
 
 
-def test_without_mirroring_nothing_is_mirrored(workplace: Path, monkeypatch) -> None:
+def test_frames_are_flipped_for_encoders_that_were_trained_so(workplace: Path, monkeypatch) -> None:
+    flipped = settings(encoder__mirror="augment")
+    train_encoder.run(flipped, QUIET, dataset=workplace / "data", out=workplace / "flipped-encoder")
     seen: list[tuple[torch.Tensor, torch.Tensor]] = []
     fit = train_hierarchy.fit_actor
 
@@ -200,11 +203,26 @@ def test_without_mirroring_nothing_is_mirrored(workplace: Path, monkeypatch) -> 
         return fit(z, labels, *rest, **options)
 
     monkeypatch.setattr(train_hierarchy, "fit_actor", spy)
-    train(workplace, "plain", encoder__mirror=False)
-    train(workplace, "mirrored")
+    symmetric = train(workplace, "plain")
+    flipped = train(workplace, "mirrored", "flipped-encoder")
     (plain_z, plain), (both_z, both) = seen
     assert len(plain) == 600 and torch.equal(both, torch.cat([plain, -plain]))
-    torch.testing.assert_close(both_z[:600], plain_z)
+    assert len(plain_z) == 600 and len(both_z) == 1200
+    modes = [model.architecture["mirror"] for model in (symmetric, flipped)]
+    assert modes == ["exact", "augment"]
+
+
+def test_a_trained_model_treats_both_sides_alike(workplace: Path) -> None:
+    model = train(workplace, "both-sides")
+    frames = np.random.default_rng(0).integers(0, 256, (5, 2, 64, 128, 3), np.uint8)
+    z, of_mirror = model.encode(frames), model.encode(frames[:, :, :, ::-1].copy())
+    torch.testing.assert_close(of_mirror, reflect(z), atol=0.05, rtol=0)  # bfloat16
+    for name in ("hjepa", "ts-jepa-1", "ts-jepa-4"):
+        with torch.inference_mode():
+            forces_n, ahead = model.planner(name).plan(z)
+            of_mirror_n, of_mirror_ahead = model.planner(name).plan(reflect(z))
+        torch.testing.assert_close(of_mirror_n, -forces_n, atol=0.02, rtol=0)
+        torch.testing.assert_close(of_mirror_ahead, reflect(ahead), atol=0.02, rtol=0)
 
 
 def test_levels_do_not_disturb_each_other(workplace: Path) -> None:

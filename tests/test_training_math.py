@@ -14,7 +14,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hjepa_cli.core import encoder as encoder_module
 from hjepa_cli.core.actor import Actor
 from hjepa_cli.core.batches import FrameWindows, TrajectoryBatch, window_indices
 from hjepa_cli.core.encoder import Encoder
@@ -44,6 +43,7 @@ class TinyEncoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
+        self.embedding = WIDTH
         self.head = nn.Linear(12, WIDTH)
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -219,14 +219,21 @@ def test_centred_embeddings_are_offset_by_one_before_their_length_is_fixed() -> 
             z = encoder(frame)[0].numpy()
         shifted = np.array(centred) + 1.0
         np.testing.assert_allclose(z, 2.0 * shifted / np.linalg.norm(shifted), atol=1e-4)
-    assert encoder_module.CENTRE_OFFSET == 1.0
 
 
+def test_a_symmetric_encoder_has_its_offset_in_the_even_half() -> None:
+    """As long as the other, and its own reflection."""
+    offset = Encoder(8, "difference", True, symmetric=True).offset
+    torch.testing.assert_close(offset, torch.tensor([2.0**0.5] * 4 + [0.0] * 4))
+    assert offset.norm() == pytest.approx(Encoder(8, "difference", True).offset.norm())
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
 @pytest.mark.parametrize("centre", [True, False])
-def test_a_folded_encoder_is_the_same_function(centre: bool) -> None:
+def test_a_folded_encoder_is_the_same_function(centre: bool, symmetric: bool) -> None:
     """Batch norms with arbitrary statistics and affine parts, moved into the convolutions."""
     torch.manual_seed(0)
-    encoder = Encoder(16, "difference", centre)
+    encoder = Encoder(16, "difference", centre, symmetric)
     with torch.no_grad():
         for layer in encoder.modules():
             if isinstance(layer, torch.nn.BatchNorm2d | torch.nn.BatchNorm1d):

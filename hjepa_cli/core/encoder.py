@@ -15,10 +15,20 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils import fuse_conv_bn_eval
 
+from hjepa_cli.core.symmetry import (
+    MirrorCentre,
+    MirrorConv2d,
+    MirrorLinear,
+    MirrorNorm2d,
+    Signs,
+    Twins,
+    embedding_signs,
+    flatten_twins,
+)
+
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
-STEM_PX = 4
+STEM_PX, STEM_CHANNELS = 4, 64
 MAP_CHANNELS = 32
-CENTRE_OFFSET = 1.0
 
 
 def normalise(z: Tensor) -> Tensor:
@@ -32,21 +42,29 @@ def normalise(z: Tensor) -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """Two 3 × 3 convolutions with batch norm around a (projected) identity."""
+    """Two convolutions with batch norm around a (projected) identity.
 
-    def __init__(self, channels_in: int, channels_out: int, stride: int) -> None:
+    A stride is taken by a kernel as wide as itself and by averaging on the way around: such grids
+    have mirror images (:mod:`hjepa_cli.core.symmetry`).
+    """
+
+    def __init__(
+        self, channels_in: int, channels_out: int, stride: int, *, symmetric: bool = False
+    ) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
-        self.norm1 = nn.BatchNorm2d(channels_out)
-        self.conv2 = nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False)
-        self.norm2 = nn.BatchNorm2d(channels_out)
-        self.project = nn.Conv2d(channels_in, channels_out, 1, stride, bias=False)
-        self.project_norm = nn.BatchNorm2d(channels_out)
+        kernel, padding = (3, 1) if stride == 1 else (stride, 0)
+        self.conv1 = _conv(channels_in, channels_out, kernel, stride, padding, symmetric)
+        self.norm1 = _norm(channels_out, symmetric)
+        self.conv2 = _conv(channels_out, channels_out, 3, 1, 1, symmetric)
+        self.norm2 = _norm(channels_out, symmetric)
+        self.shrink = nn.AvgPool2d(stride) if stride > 1 else nn.Identity()
+        self.project = _conv(channels_in, channels_out, 1, 1, 0, symmetric)
+        self.project_norm = _norm(channels_out, symmetric)
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, channels_in, H, W] → [N, channels_out, H / stride, W / stride]."""
         y = F.relu(self.norm1(self.conv1(x)))
-        return F.relu(self.norm2(self.conv2(y)) + self.project_norm(self.project(x)))
+        return F.relu(self.norm2(self.conv2(y)) + self.project_norm(self.project(self.shrink(x))))
 
     def fold(self) -> None:
         """Move the batch norms into the convolutions, for good."""
@@ -67,25 +85,42 @@ class Encoder(nn.Module):
             every value. Centred embeddings alone have no direction at the mean state, the upright
             pole of all states; with an offset as long as themselves, fixing their length bends
             them little there and the states stay linearly readable (docs/LOG.md).
+        symmetric: built so that the embedding of a mirrored picture is the reflected embedding
+            (:mod:`hjepa_cli.core.symmetry`); D is even then, and the offset is on the even half.
     """
 
     input_mean: Tensor
     input_std: Tensor
+    offset: Tensor
 
-    def __init__(self, embedding: int, frame_input: str, centre: bool) -> None:
+    def __init__(
+        self, embedding: int, frame_input: str, centre: bool, symmetric: bool = False
+    ) -> None:
         super().__init__()
-        self.frame_input = frame_input
+        self.embedding, self.frame_input, self.symmetric = embedding, frame_input, symmetric
         self.register_buffer("input_mean", torch.zeros(2 * CHANNELS))
         self.register_buffer("input_std", torch.ones(2 * CHANNELS))
-        self.stem = nn.Conv2d(2 * CHANNELS, 64, STEM_PX, STEM_PX, bias=False)
-        self.stem_norm = nn.BatchNorm2d(64)
+        halves = 2 if symmetric else 1
+        self.stem = nn.Conv2d(2 * CHANNELS, STEM_CHANNELS // halves, STEM_PX, STEM_PX, bias=False)
+        self.stem_norm = _norm(STEM_CHANNELS, symmetric)
         self.stages = nn.Sequential(
-            ResidualBlock(64, 64, 2), ResidualBlock(64, 128, 2), ResidualBlock(128, 256, 1)
+            ResidualBlock(STEM_CHANNELS, 64, 2, symmetric=symmetric),
+            ResidualBlock(64, 128, 2, symmetric=symmetric),
+            ResidualBlock(128, 256, 1, symmetric=symmetric),
         )
-        map_size = (HEIGHT_PX // (STEM_PX * 4)) * (WIDTH_PX // (STEM_PX * 4))
-        self.squeeze = nn.Conv2d(256, MAP_CHANNELS, 1)
-        self.head = nn.Linear(MAP_CHANNELS * map_size, embedding)
-        self.centre = nn.BatchNorm1d(embedding, affine=False) if centre else None
+        features = MAP_CHANNELS * (HEIGHT_PX // (STEM_PX * 4)) * (WIDTH_PX // (STEM_PX * 4))
+        self.squeeze = _conv(256, MAP_CHANNELS, 1, 1, 0, symmetric, bias=True)
+        self.head: nn.Module = nn.Linear(features, embedding)
+        self.centre: nn.Module | None = nn.BatchNorm1d(embedding, affine=False)
+        offset = torch.ones(embedding)
+        if symmetric:
+            signs = embedding_signs(embedding)
+            self.head = MirrorLinear(Twins(features), Signs(signs))
+            self.centre = MirrorCentre(embedding)
+            offset = 2**0.5 * (torch.tensor(signs) > 0)  # a reflection must not change it
+        if not centre:
+            self.centre = None
+        self.register_buffer("offset", offset, persistent=False)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def fit_standardisation(self, frames: Tensor) -> None:
@@ -105,21 +140,21 @@ class Encoder(nn.Module):
             x = x.float()
         x = F.relu(self.stem_norm(F.conv2d(x, *self._stem(), stride=STEM_PX)))
         x = F.relu(self.squeeze(self.stages(x)))
-        z = self.head(x.flatten(1)).float()
-        return normalise(z if self.centre is None else self.centre(z) + CENTRE_OFFSET)
+        z = self.head(flatten_twins(x) if self.symmetric else x.flatten(1)).float()
+        return normalise(z if self.centre is None else self.centre(z) + self.offset)
 
     @torch.no_grad()
     def folded(self) -> Self:
         """A copy for inference, with all batch norms inside the convolutions: same z, sooner."""
         frozen = copy.deepcopy(self).eval()
         weight, offset = frozen._stem()
+        frozen.stem = nn.Conv2d(2 * CHANNELS, STEM_CHANNELS, STEM_PX, STEM_PX).eval()
         frozen.stem.weight, frozen.stem.bias = nn.Parameter(weight), nn.Parameter(offset)
         _fold(frozen, "stem", "stem_norm")
         frozen.input_mean.zero_()
         frozen.input_std.fill_(1.0)
-        for block in frozen.modules():
-            if isinstance(block, ResidualBlock):
-                block.fold()
+        for block in frozen.stages:
+            block.fold()  # type: ignore[operator]
         return frozen
 
     def _stem(self) -> tuple[Tensor, Tensor]:
@@ -129,7 +164,11 @@ class Encoder(nn.Module):
         """
         weight = self.stem.weight / self.input_std[:, None, None]
         offset = -(weight * self.input_mean[:, None, None]).sum((1, 2, 3))
-        return weight, offset if self.stem.bias is None else offset + self.stem.bias
+        if self.stem.bias is not None:
+            offset = offset + self.stem.bias
+        if len(weight) < STEM_CHANNELS:  # a picture's twin is the picture through mirrored eyes
+            weight, offset = torch.cat([weight, weight.flip(-1)]), torch.cat([offset, offset])
+        return weight, offset
 
     def _inputs(self, frames: Tensor) -> Tensor:
         """Both inputs [N, 6, H, W] in bfloat16: pixels and their differences are exact in it."""
@@ -139,8 +178,30 @@ class Encoder(nn.Module):
         return torch.cat([current, second], dim=-1).permute(0, 3, 1, 2)
 
 
+def _conv(
+    channels_in: int,
+    channels_out: int,
+    kernel: int,
+    stride: int,
+    padding: int,
+    symmetric: bool,
+    *,
+    bias: bool = False,
+) -> nn.Conv2d:
+    kind = MirrorConv2d if symmetric else nn.Conv2d
+    return kind(channels_in, channels_out, kernel, stride, padding, bias=bias)
+
+
+def _norm(channels: int, symmetric: bool) -> nn.BatchNorm2d:
+    return MirrorNorm2d(channels) if symmetric else nn.BatchNorm2d(channels)
+
+
 def _fold(module: nn.Module, convolution: str, norm: str) -> None:
-    """Move one batch norm's running statistics and affine part into its convolution."""
-    fused = fuse_conv_bn_eval(getattr(module, convolution), getattr(module, norm))
-    setattr(module, convolution, fused)
+    """Move one batch norm's running statistics and affine part into its convolution, for good."""
+    pair = [getattr(module, name) for name in (convolution, norm)]
+    ordinary = [
+        layer.ordinary() if isinstance(layer, MirrorConv2d | MirrorNorm2d) else layer
+        for layer in pair
+    ]
+    setattr(module, convolution, fuse_conv_bn_eval(*ordinary))
     setattr(module, norm, nn.Identity())

@@ -6,7 +6,7 @@ Actions are in units of the force limit everywhere in this file; *A is their sha
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import torch
@@ -166,10 +166,11 @@ def build_predictors(
     all_actions: bool,
     residual: bool,
     forces: int = 1,
+    mirror: Sequence[float] | None = None,
 ) -> dict[str, Predictor]:
     """The three levels and the flat baseline ``ts-jepa-1``, keyed as in the checkpoint.
 
-    ``forces`` drive a device at every step.
+    ``forces`` drive a device at every step; ``mirror`` as for :class:`Predictor`.
     """
     h, m, l = strides.h, strides.m, strides.l
 
@@ -180,6 +181,7 @@ def build_predictors(
             steps * forces if all_actions else forces,
             anchored=bool(anchoring),
             residual=residual,
+            mirror=mirror,
             **anchoring,
         )
 

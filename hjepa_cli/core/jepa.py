@@ -1,6 +1,6 @@
 """The joint-embedding objective: context encoder, EMA target, companion P^H, inverse dynamics."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,7 @@ class Jepa:
         inverse_dynamics: weight of the inverse-dynamics loss; 0 leaves it out.
         rollout_strides: length of the training rollouts in strides.
         forces: how many drive a device.
+        mirror: as for :class:`Predictor`, of the auxiliary task.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class Jepa:
         rollout_strides: int,
         device: torch.device,
         forces: int = 1,
+        mirror: Sequence[float] | None = None,
     ) -> None:
         self.encoder, self.predictor = encoder.to(device), predictor.to(device)
         self.target = EmaTarget(encoder, ema_decay)
@@ -43,7 +45,8 @@ class Jepa:
         self.inverse: InverseDynamics | None = None
         if inverse_dynamics > 0.0:
             self.weights["inverse_dynamics"] = inverse_dynamics
-            self.inverse = InverseDynamics(encoder.head.out_features, forces=forces).to(device)
+            self.inverse = InverseDynamics(encoder.embedding, forces=forces, mirror=mirror)
+            self.inverse.to(device)
         self.device = device
 
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:

@@ -1,8 +1,12 @@
 """Training objectives, as pure functions of tensors."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs
 
 
 def cosine_loss(predicted: Tensor, target: Tensor) -> Tensor:
@@ -25,11 +29,21 @@ class InverseDynamics(nn.Module):
     recipe from useless to better than supervised, see docs/LOG.md). Used in training only.
     """
 
-    def __init__(self, embedding: int, hidden: int = 256, *, forces: int = 1) -> None:
+    def __init__(
+        self,
+        embedding: int,
+        hidden: int = 256,
+        *,
+        forces: int = 1,
+        mirror: Sequence[float] | None = None,
+    ) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(2 * embedding, hidden), nn.ReLU(), nn.Linear(hidden, forces)
-        )
+        linear: list[nn.Module] = [nn.Linear(2 * embedding, hidden), nn.Linear(hidden, forces)]
+        if mirror is not None:
+            units = Twins(2 * hidden)
+            z = embedding_signs(embedding)
+            linear = [MirrorLinear(Signs(z + z), units), MirrorLinear(units, Signs(mirror))]
+        self.layers = nn.Sequential(linear[0], nn.ReLU(), linear[1])
 
     def loss(self, z: Tensor, z_next: Tensor, action: Tensor) -> Tensor:
         """Mean squared error of the action, in units of half the force limit (10 N).

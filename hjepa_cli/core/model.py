@@ -28,23 +28,27 @@ CHOICES = {  # of an architecture; its other values are sizes
     "stride_actions": ("all", "held"),
     "centre": (True, False),
     "residual": (True, False),
+    "mirror": ("exact", "augment", "none"),
 }
 PRECISIONS = ("auto", "bf16", "fp32")
 
 
 def build_modules(
-    architecture: Mapping[str, Any], action_shape: tuple[int, ...] = ()
+    architecture: Mapping[str, Any],
+    action_shape: tuple[int, ...] = (),
+    force_signs: tuple[float, ...] = (-1.0,),
 ) -> nn.ModuleDict:
     """Instantiate the networks that ``architecture`` (checkpoint metadata) describes, untrained.
 
     ``kind`` "encoder" has Ψ and its companion P^H; "hierarchy" has Ψ, all levels and the actor.
-    ``action_shape`` is the plant's.
+    ``action_shape`` and ``force_signs`` are the plant's.
     """
     embedding, hidden = architecture["embedding"], architecture["hidden"]
     strides = Strides(architecture["h"], architecture["m"], architecture["l"])
-    modules = nn.ModuleDict(
-        {"encoder": Encoder(embedding, architecture["frame_input"], architecture["centre"])}
-    )
+    symmetric = architecture["mirror"] == "exact"
+    mirror = force_signs if symmetric else None
+    frame_input, centre = architecture["frame_input"], architecture["centre"]
+    modules = nn.ModuleDict({"encoder": Encoder(embedding, frame_input, centre, symmetric)})
     predictors = build_predictors(
         strides,
         embedding,
@@ -52,14 +56,14 @@ def build_modules(
         all_actions=architecture["stride_actions"] == "all",
         residual=architecture["residual"],
         forces=math.prod(action_shape),
+        mirror=mirror,
     )
     if architecture["kind"] == "encoder":
         modules["high"] = predictors["high"]
         return modules
     modules.update(predictors)
-    modules["actor"] = Actor(
-        embedding, architecture["actor_hidden"], architecture["actor_dropout"], action_shape
-    )
+    hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
+    modules["actor"] = Actor(embedding, hidden, dropout, action_shape, mirror)
     return modules
 
 
@@ -72,10 +76,10 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
         DataError: there is no such architecture, or the tensors do not fit it.
     """
     metadata = check_metadata(checkpoint)
-    architecture, action_shape = metadata["architecture"], plant(metadata["plant"]).action_shape
+    architecture, kind = metadata["architecture"], plant(metadata["plant"])
     try:
         with torch.device("meta"):
-            planned = build_modules(architecture, action_shape).state_dict()
+            planned = build_modules(architecture, kind.action_shape, kind.force_signs).state_dict()
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError, UsageError) as error:
         reason = str(error).partition("\n")[0]
         raise DataError(
@@ -86,7 +90,7 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
         for name, tensor in planned.items()
     }
     check_tensors(checkpoint, expected)
-    modules = build_modules(architecture, action_shape)
+    modules = build_modules(architecture, kind.action_shape, kind.force_signs)
     modules.load_state_dict(
         {name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()}
     )

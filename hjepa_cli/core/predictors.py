@@ -4,10 +4,13 @@ The same network serves all levels (paper eqs. 6, 8, 9): P^H sees z and the stri
 and P^L also see the coarser prediction they interpolate towards.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from hjepa_cli.core.encoder import normalise
+from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs
 
 
 class Predictor(nn.Module):
@@ -23,6 +26,8 @@ class Predictor(nn.Module):
             and then it is an input.
         residual: predict the change from the input embedding (anchored: from the linear
             interpolation towards the anchor) instead of the embedding itself.
+        mirror: what a mirror does to the forces of a step, a factor for each; then the prediction
+            from reflected inputs is the reflected one. ``None``: an ordinary network.
     """
 
     def __init__(
@@ -34,16 +39,23 @@ class Predictor(nn.Module):
         anchored: bool = False,
         distances: int = 1,
         residual: bool = True,
+        mirror: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         self.actions, self.anchored, self.residual = actions, anchored, residual
         self.sees_distance = anchored and distances > 2
         inputs = embedding * (2 if anchored else 1) + actions + int(self.sees_distance)
-        self.hidden = nn.Linear(inputs, hidden)
-        self.output = nn.Linear(hidden, embedding)
+        self.hidden: nn.Module = nn.Linear(inputs, hidden)
+        self.output: nn.Module = nn.Linear(hidden, embedding)
+        if mirror is not None:
+            z = embedding_signs(embedding)
+            forces = tuple(mirror) * (actions // len(mirror))
+            signs = z + forces + (z if anchored else ()) + (1.0,) * self.sees_distance
+            self.hidden = MirrorLinear(Signs(signs), Twins(hidden))
+            self.output = MirrorLinear(Twins(hidden), Signs(z))
         if residual:
-            nn.init.zeros_(self.output.weight)
-            nn.init.zeros_(self.output.bias)
+            for parameter in self.output.parameters():
+                nn.init.zeros_(parameter)
 
     def forward(
         self, z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1

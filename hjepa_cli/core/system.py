@@ -178,6 +178,11 @@ class System(abc.ABC):
         """λ/ln 2: no controller stabilises it from fewer bit/s (data-rate theorem)."""
         return self.unstable_rate_rad_s / math.log(2)
 
+    @property
+    def force_signs(self) -> tuple[float, ...]:
+        """:attr:`mirror` as one factor for each force."""
+        return tuple(np.ravel(self.mirror).tolist())
+
     def no_force(self, devices: int) -> Floats:
         """Forces of ``devices`` devices that do nothing, ``[n, *A]``."""
         return np.zeros((devices, *self.action_shape))

@@ -1,7 +1,7 @@
 """What all training loops share: device, precision, optimiser and its schedule."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 
 import torch
@@ -132,7 +132,13 @@ class Optimiser:
 
 
 def fit_actor(
-    z: Tensor, actions: Tensor, settings: ActorSettings, *, seed: int, epochs: int | None = None
+    z: Tensor,
+    actions: Tensor,
+    settings: ActorSettings,
+    *,
+    seed: int,
+    epochs: int | None = None,
+    mirror: Sequence[float] | None = None,
 ) -> Actor:
     """Fit the semantic actor on frozen embeddings by AdamW on the mean squared error.
 
@@ -140,6 +146,7 @@ def fit_actor(
         z: embeddings [N, D].
         actions: teacher's labels [N, *A] in units of the force limit.
         epochs: passes over z, ``settings.epochs`` by default.
+        mirror: as for :class:`Actor`.
 
     Returns:
         The actor in evaluation mode, on the device of ``z``.
@@ -147,7 +154,7 @@ def fit_actor(
     torch.manual_seed(seed)
     actions = actions.to(z.device)
     shape = tuple(actions.shape[1:])
-    actor = Actor(z.shape[1], settings.hidden, settings.dropout, shape).to(z.device)
+    actor = Actor(z.shape[1], settings.hidden, settings.dropout, shape, mirror).to(z.device)
     batches = max(len(z) // settings.batch, 1)
     total = batches * (epochs or settings.epochs)
     optimiser = Optimiser(

@@ -67,7 +67,8 @@ def run(
         screen.say(f"dataset {data.path} ({settings.plant}), run {record.directory}")
         train, test = (render(split, settings.plant, screen) for split in recorded.values())
         architecture = describe_architecture(settings)
-        modules = build_modules(architecture, plant(settings.plant).action_shape)
+        kind = plant(settings.plant)
+        modules = build_modules(architecture, kind.action_shape, kind.force_signs)
         encoder, companion = modules["encoder"], modules["high"]
         assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
         train_jepa(encoder, companion, train, test, settings, record, progress, screen)
@@ -115,6 +116,7 @@ def describe_architecture(settings: Settings) -> dict[str, Any]:
         "centre": encoder.centre,
         "stride_actions": encoder.stride_actions,
         "residual": encoder.residual,
+        "mirror": encoder.mirror,
         "h": encoder.h,
         "m": encoder.h,  # one level: the companion
         "l": encoder.h,
@@ -143,6 +145,7 @@ def train_jepa(
         rollout_strides=max(options.rollout_steps // options.h, 1),
         device=device,
         forces=math.prod(kind.action_shape),
+        mirror=kind.force_signs if options.mirror == "exact" else None,
     )
     optimiser = Optimiser(
         jepa.parameters(),
@@ -158,7 +161,7 @@ def train_jepa(
         train.actions,
         window_frames=options.batch_frames,
         stride=options.h,
-        mirror=options.mirror,
+        mirror=options.mirror == "augment",
         shift_px=options.shift_px,
         mirrored_actions=kind.mirror,
     )
@@ -205,7 +208,7 @@ def examine(
 
     ``every`` divides h, so that the embeddings a stride apart are among them.
     ``epochs`` limits the probe actor's fit; ``None`` fits it in full, on mirrored frames too when
-    training is mirrored.
+    training flips them.
     """
     options, device = settings.encoder, resolve_device(settings.device)
     kind = plant(settings.plant)
@@ -215,11 +218,18 @@ def examine(
     per_trajectory, train_z, test_z = test_z, train_z.flatten(0, 1), test_z.flatten(0, 1)
     train_states, test_states = train.states_at(every), test.states_at(every)
     fit_z, fit_labels = train_z, train.labels_at(every)
-    if epochs is None and options.mirror:
+    if epochs is None and options.mirror == "augment":
         mirrored = embed(encoder, train, settings, every=every, mirrored=True)
         fit_z = torch.cat([fit_z, mirrored.flatten(0, 1)])
         fit_labels = torch.cat([fit_labels, torch.tensor(kind.mirror) * fit_labels])
-    actor = fit_actor(fit_z, fit_labels, settings.actor, seed=settings.seed, epochs=epochs)
+    actor = fit_actor(
+        fit_z,
+        fit_labels,
+        settings.actor,
+        seed=settings.seed,
+        epochs=epochs,
+        mirror=kind.force_signs if options.mirror == "exact" else None,
+    )
     ahead = options.h // every
     start, end = per_trajectory[:, :-ahead].flatten(0, 1), per_trajectory[:, ahead:].flatten(0, 1)
     with torch.no_grad():

@@ -80,8 +80,8 @@ def run(
             return record.result
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path}, encoder {source.path}, run {record.directory}")
-        architecture = describe_architecture(source, settings)
-        modules = build_modules(architecture, plant(settings.plant).action_shape)
+        architecture, kind = describe_architecture(source, settings), plant(settings.plant)
+        modules = build_modules(architecture, kind.action_shape, kind.force_signs)
         modules["encoder"].load_state_dict(trained["encoder"].state_dict())
         modules["encoder"].requires_grad_(False).eval()
         if source.metadata["architecture"]["h"] == strides.h:
@@ -89,7 +89,9 @@ def run(
         modules.to(resolve_device(settings.device))
 
         train, test = (render(split, settings.plant, screen) for split in recorded.values())
-        seen = embed_all(modules["encoder"], train, settings, screen)
+        exact = architecture["mirror"] == "exact"
+        flip = architecture["mirror"] == "augment"
+        seen = embed_all(modules["encoder"], train, settings, screen, flip=flip)
         if progress.fresh:  # otherwise it comes back with the levels
             screen.say("fitting the semantic actor")
             actor = fit_actor(
@@ -97,6 +99,7 @@ def run(
                 torch.cat([labels.flatten(0, 1) for _, labels in seen]),
                 settings.actor,
                 seed=settings.seed,
+                mirror=kind.force_signs if exact else None,
             )
             modules["actor"].load_state_dict(actor.state_dict())
         embedded = [data for data, _ in seen]
@@ -204,11 +207,11 @@ def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, A
 
 
 def embed_all(
-    encoder: nn.Module, train: RenderedSplit, settings: Settings, screen: Screen
+    encoder: nn.Module, train: RenderedSplit, settings: Settings, screen: Screen, *, flip: bool
 ) -> list[tuple[EmbeddedTrajectories, Tensor]]:
-    """Embeddings and labels [N, T, *A] of the training frames; mirrored too where that is on."""
+    """Embeddings and labels [N, T, *A] of the training frames, and with ``flip`` of their mirror images."""
     device, mirror = resolve_device(settings.device), torch.tensor(plant(settings.plant).mirror)
-    views = (False, True) if settings.encoder.mirror else (False,)
+    views = (False, True) if flip else (False,)
     seen = []
     with screen.progress("encode", len(views) * len(train.frames), "trajectories") as bar:
         for mirrored in views:

@@ -1,0 +1,186 @@
+"""Networks that commute with a mirror: what they see mirrored, they do mirrored.
+
+A picture flipped left to right shows the plant in its mirrored state, and mirrored forces move that
+one mirrored. The layers here obey this exactly, whatever their weights: nothing that was learned
+on one side has to be learned again on the other, and an upright pole, its own mirror image, gets no
+force at all. Data that is merely flipped at random teaches this only roughly, and the rest is a bias
+that pushes on while no packet arrives (docs/LOG.md).
+
+A mirror does one of two things to a vector. To ``Signs`` it gives or takes minus signs: embeddings,
+of which the first half is even and the second odd, and forces. Of ``Twins`` it swaps the two halves:
+hidden units, and the channels of feature maps, which are flipped as well. Nonlinearities act on
+twins only. A linear map that commutes with the mirror maps even parts to even ones and odd parts to
+odd ones, each on its own (Schur's lemma), at half the multiplications of an arbitrary map.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+HALF = 0.5**0.5
+
+
+def embedding_signs(embedding: int) -> tuple[float, ...]:
+    """What a mirror does to an embedding of D values: the first half is even, the second odd."""
+    return (1.0,) * (embedding // 2) + (-1.0,) * (embedding // 2)
+
+
+def reflect(z: Tensor) -> Tensor:
+    """The embeddings [..., D] of the mirrored pictures."""
+    even, odd = z.chunk(2, dim=-1)
+    return torch.cat([even, -odd], dim=-1)
+
+
+class Signs(nn.Module):
+    """Vectors [..., n] of which a mirror changes some signs.
+
+    Args:
+        factors: 1 or −1 for each value.
+    """
+
+    order: Tensor
+
+    def __init__(self, factors: Sequence[float]) -> None:
+        super().__init__()
+        even = [i for i, factor in enumerate(factors) if factor > 0]
+        odd = [i for i, factor in enumerate(factors) if factor <= 0]
+        self.even, self.odd = len(even), len(odd)
+        self._sorted = even + odd == list(range(len(factors)))
+        self.register_buffer("order", torch.tensor(even + odd), persistent=False)
+
+    def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """[..., n] → even part [..., n_even], odd part [..., n_odd]."""
+        x = x if self._sorted else x[..., self.order]
+        return x[..., : self.even], x[..., self.even :]
+
+    def join(self, even: Tensor, odd: Tensor) -> Tensor:
+        """Undo :meth:`split`."""
+        x = torch.cat([even, odd], dim=-1)
+        return x if self._sorted else x[..., torch.argsort(self.order)]
+
+
+class Twins(nn.Module):
+    """Vectors [..., n] whose two halves a mirror swaps."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.even = self.odd = size // 2
+
+    def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """[..., n] → sum and difference of the halves, [..., n / 2] each."""
+        right, left = x.chunk(2, dim=-1)
+        return HALF * (right + left), HALF * (right - left)
+
+    def join(self, even: Tensor, odd: Tensor) -> Tensor:
+        """Undo :meth:`split`."""
+        return HALF * torch.cat([even + odd, even - odd], dim=-1)
+
+
+class MirrorLinear(nn.Module):
+    """A linear layer that commutes with the mirror; the even part alone has a bias."""
+
+    def __init__(self, inputs: Signs | Twins, outputs: Signs | Twins) -> None:
+        super().__init__()
+        self.inputs, self.outputs = inputs, outputs
+        # Nothing is learned for a part that the outputs lack: a single force is odd.
+        self.even = nn.Linear(inputs.even, outputs.even) if outputs.even else None
+        self.odd = nn.Linear(inputs.odd, outputs.odd, bias=False) if outputs.odd else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[..., n_in] → [..., n_out]."""
+        even, odd = self.inputs.split(x)
+        return self.outputs.join(
+            even[..., :0] if self.even is None else self.even(even),
+            odd[..., :0] if self.odd is None else self.odd(odd),
+        )
+
+
+class MirrorConv2d(nn.Conv2d):
+    """A convolution from twins to twins; arguments as of ``nn.Conv2d``, channels of both halves.
+
+    Only the right half's weights exist; the left half sees its twin's inputs through the mirrored
+    kernel. With a stride the kernel must be as wide, or the grid of outputs has no mirror image.
+    """
+
+    def __init__(
+        self,
+        channels_in: int,
+        channels_out: int,
+        kernel: int,
+        stride: int = 1,
+        padding: int = 0,
+        *,
+        bias: bool = False,
+    ) -> None:
+        super().__init__(channels_in, channels_out // 2, kernel, stride, padding, bias=bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, channels_in, H, W] → [N, channels_out, H', W']."""
+        return F.conv2d(x, *self.both_halves(), self.stride, self.padding)
+
+    def both_halves(self) -> tuple[Tensor, Tensor | None]:
+        """Weights [channels_out, channels_in, k, k] and bias of the same map, without a twin."""
+        own, other = self.weight.chunk(2, dim=1)
+        weight = torch.cat([self.weight, torch.cat([other, own], dim=1).flip(-1)])
+        return weight, None if self.bias is None else torch.cat([self.bias, self.bias])
+
+    def ordinary(self) -> nn.Conv2d:
+        """The same map as an ordinary convolution."""
+        weight, bias = self.both_halves()
+        out, into, kernel, _ = weight.shape
+        layer = nn.Conv2d(into, out, kernel, self.stride, self.padding, bias=bias is not None)  # type: ignore[arg-type]
+        layer.weight.data = weight.detach().contiguous(memory_format=torch.channels_last)
+        if layer.bias is not None and bias is not None:
+            layer.bias.data = bias.detach()
+        return layer.eval()
+
+
+class MirrorNorm2d(nn.BatchNorm2d):
+    """Batch norm of twins: one mean, variance, scale and offset for a channel and its twin."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels // 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, channels, H, W] → the same shape."""
+        n, channels, height, width = x.shape
+        # Channels-last memory: twins are neighbouring pixels of a map twice as wide, for free.
+        wide = x.permute(0, 2, 3, 1).reshape(n, height, 2 * width, channels // 2)
+        normed = super().forward(wide.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+        return normed.reshape(n, height, width, channels).permute(0, 3, 1, 2)
+
+    def ordinary(self) -> nn.BatchNorm2d:
+        """The same map, in evaluation mode, as an ordinary batch norm."""
+        layer = nn.BatchNorm2d(2 * self.num_features, eps=self.eps).eval()
+        state = self.state_dict()
+        layer.load_state_dict(
+            {
+                key: torch.cat([value, value]) if value.dim() else value
+                for key, value in state.items()
+            }
+        )
+        return layer
+
+
+class MirrorCentre(nn.Module):
+    """Batch norm of embeddings without affine part; odd values keep their sign, so have mean 0."""
+
+    def __init__(self, embedding: int) -> None:
+        super().__init__()
+        self.even = nn.BatchNorm1d(embedding // 2, affine=False)
+        self.odd = nn.BatchNorm1d(embedding // 2, affine=False)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """[N, D] → [N, D]."""
+        even, odd = z.chunk(2, dim=-1)
+        # A batch and its mirror image have mean 0, and so has the running mean.
+        both = self.odd(torch.cat([odd, -odd]))
+        return torch.cat([self.even(even), both[: len(z)]], dim=-1)
+
+
+def flatten_twins(x: Tensor) -> Tensor:
+    """Feature maps of twins [N, C, H, W] → twins [N, C · H · W] without a place: none is flipped."""
+    right, left = x.chunk(2, dim=1)
+    return torch.cat([right.flatten(1), left.flip(-1).flatten(1)], dim=-1)
