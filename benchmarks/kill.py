@@ -2,21 +2,30 @@
 
     python benchmarks/kill.py --kills 20 --seed 0
 
-Every stage runs in a child process of its own and is killed at moments drawn over the time it
-takes. After each kill, every file that is there under its own name must load; the same command
-is then given again. In the end datasets, checkpoints, ``metrics.csv``, curves and tables must be
-the bytes of a run that was not killed. Prints kills, moments and how many came during a write.
+Every stage runs in a child process of its own and is killed right before one of its calls that
+touch the disk, drawn among all of them. Between two such calls a kill finds the same disk at any
+time, so these are all the moments there are (but for those inside a single write, of which
+tests/test_files.py takes care), and they do not depend on the machine's speed. After each kill,
+every file that is there under its own name must load; the same command is then given again. In
+the end datasets, checkpoints, ``metrics.csv``, curves and tables must be the bytes of a run that
+was not killed. Prints kills, and how many came during a write.
 """
 
 import argparse
 import io
 import multiprocessing
+import os
 import random
+import signal
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.context import BaseContext
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import torch
 
@@ -29,6 +38,9 @@ from hjepa_cli.storage.datasets import load_dataset
 from hjepa_cli.storage.runs import METRICS, RESULT
 
 STAGES = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
+DISK = frozenset(
+    ("open", "write", "flush", "close", "__exit__", "fsync", "replace", "unlink", "mkdir")
+)
 COMPARED = ("*.safetensors", "dataset.json", METRICS, "curves.json", "devices.csv", "config.toml")
 SETTINGS = load_settings(
     flags={
@@ -63,8 +75,32 @@ SETTINGS = load_settings(
 )
 
 
-def run_stage(stage: str, root: Path, out: Path) -> None:
-    """Run one stage into ``out``, saving its state after every step; the target of the child."""
+def run_stage(
+    stage: str, root: Path, out: Path, last: int = 0, calls: "Synchronized[int] | None" = None
+) -> None:
+    """Run one stage into ``out``, saving its state after every step; the target of the child.
+
+    Args:
+        last: number of the call to the disk before which the process is killed; 0: never.
+        calls: is told how many there were.
+    """
+    count = 0
+
+    def look(frame: FrameType, event: str, called: Any) -> None:
+        nonlocal count
+        if event == "c_call" and called.__name__ in DISK:
+            count += 1
+            if count == last:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.setprofile(look)
+    _run_stage(stage, root, out)
+    sys.setprofile(None)
+    if calls is not None:
+        calls.value = count
+
+
+def _run_stage(stage: str, root: Path, out: Path) -> None:
     torch.set_num_threads(1)
     progress.SAVE_EVERY_S = 0.0
     datasets.SHARD_TRAJECTORIES = 1
@@ -82,11 +118,12 @@ def run_stage(stage: str, root: Path, out: Path) -> None:
         module.run(SETTINGS, screen, checkpoint=model, out=out, remeasure=True)
 
 
-def start(context: BaseContext, stage: str, root: Path, out: Path) -> multiprocessing.Process:
-    """A child that runs a stage, forked from a process that has everything imported."""
-    child = context.Process(target=run_stage, args=(stage, root, out))  # type: ignore[attr-defined]
+def run_child(context: BaseContext, *arguments: Any) -> int | None:
+    """Exit code of :func:`run_stage` in a child, forked from one that has everything imported."""
+    child = context.Process(target=run_stage, args=arguments)  # type: ignore[attr-defined]
     child.start()
-    return child
+    child.join()
+    return child.exitcode  # type: ignore[no-any-return]
 
 
 def context() -> BaseContext:
@@ -117,31 +154,34 @@ def check_files(directory: Path) -> int:
 
 
 def kill_stage(
-    chosen: BaseContext, stage: str, root: Path, out: Path, seconds: float, moments: list[float]
-) -> int:
-    """Run ``stage`` into ``out``, killed at ``moments`` (of its whole time), then to the end.
+    chosen: BaseContext, stage: str, root: Path, out: Path, calls: int, moments: Sequence[float]
+) -> tuple[int, int]:
+    """Run ``stage`` into ``out``, killed at ``moments``, then to the end.
+
+    Args:
+        calls: how often the whole stage touches the disk.
+        moments: shares of the calls that are left.
 
     Returns:
-        How many kills came while a file was being written.
+        How many kills hit, and how many of them while a file was being written.
 
     Raises:
         AssertionError: a child failed by itself, or the end differs from ``root/stage``.
         HjepaError: a file does not load after a kill.
     """
-    writing = 0
+    killed = writing = 0
     for moment in moments:
-        child = start(chosen, stage, root, out)
-        child.join(moment * seconds)
-        child.kill()
-        child.join()
-        assert child.exitcode in (-9, 0), f"{stage} failed by itself: {child.exitcode}"
+        last = 1 + int(moment * calls)
+        code = run_child(chosen, stage, root, out, last)
+        assert code in (-signal.SIGKILL, 0), f"{stage} failed by itself: {code}"
+        killed += code != 0
         writing += check_files(out)
-    child = start(chosen, stage, root, out)
-    child.join()
-    assert child.exitcode == 0, f"{stage} does not go on: {child.exitcode}"
+        calls = max(calls - last, 1)
+    code = run_child(chosen, stage, root, out)
+    assert code == 0, f"{stage} does not go on: {code}"
     compare(root / stage, out)
     assert check_files(out) == 0, "half-written files are left behind"
-    return writing
+    return killed, writing
 
 
 def compare(whole: Path, killed: Path) -> None:
@@ -154,13 +194,11 @@ def compare(whole: Path, killed: Path) -> None:
     assert (killed / RESULT).exists() or (killed / datasets.MANIFEST).exists()
 
 
-def run_whole(chosen: BaseContext, stage: str, root: Path) -> float:
-    """Run a stage without a kill into ``root/stage``; return its seconds."""
-    started = time.monotonic()
-    child = start(chosen, stage, root, root / stage)
-    child.join()
-    assert child.exitcode == 0, stage
-    return time.monotonic() - started
+def run_whole(chosen: BaseContext, stage: str, root: Path) -> int:
+    """Run a stage without a kill into ``root/stage``; return how often it touches the disk."""
+    calls = chosen.Value("q", 0)
+    assert run_child(chosen, stage, root, root / stage, 0, calls) == 0, stage
+    return int(calls.value)
 
 
 def main(report: Callable[[str], None] = print) -> None:
@@ -172,17 +210,18 @@ def main(report: Callable[[str], None] = print) -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         for stage in STAGES:
-            seconds = run_whole(chosen, stage, root)
-            moments = [chance.random() for _ in range(options.kills)]
-            # Each kill of a chain leaves less to do, so a few chains reach all moments.
-            chains = [moments[first::4] for first in range(4) if moments[first::4]]
-            writing = sum(
-                kill_stage(chosen, stage, root, root / f"{stage}-{number}", seconds, chain)
-                for number, chain in enumerate(chains)
-            )
+            started = time.monotonic()
+            calls = run_whole(chosen, stage, root)
+            killed = writing = runs = 0
+            while killed < options.kills:  # each kill of a run leaves less to do: a few per run
+                moments = [chance.random() for _ in range(min(4, options.kills - killed))]
+                out = root / f"{stage}-{runs}"
+                hit, inside = kill_stage(chosen, stage, root, out, calls, moments)
+                killed, writing, runs = killed + hit, writing + inside, runs + 1
             report(
-                f"{stage}: {seconds:.1f} s whole; {options.kills} kills in {len(chains)} runs, "
-                f"{writing} during a write; all files load, all ends are equal"
+                f"{stage}: {calls} calls to the disk; {killed} kills in {runs} runs, {writing} "
+                f"during a write, in {time.monotonic() - started:.0f} s; all files load, all ends "
+                "are equal"
             )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hjepa_cli.errors import UsageError
-from hjepa_cli.settings import RadioSettings, Settings
+from hjepa_cli.settings import RadioSettings, Settings, dotted
 
 # Spec §8: every method `eval` and `scale` may be asked for; those without a model are skipped.
 METHODS = (
@@ -167,16 +167,12 @@ def _check_number(key: str, value: float) -> None:
         raise UsageError(f"{key} = {value}; expected less than 1")
 
 
-def _numbers(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+def _numbers(values: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
     """Every number of nested settings with its dotted key; those in lists one by one."""
-    for key, value in values.items():
-        name = prefix + key
-        if isinstance(value, Mapping):
-            yield from _numbers(value, f"{name}.")
-        else:
-            for entry in value if isinstance(value, list) else [value]:
-                if isinstance(entry, int | float) and not isinstance(entry, bool):
-                    yield name, entry
+    for key, value in dotted(values).items():
+        for entry in value if isinstance(value, list) else [value]:
+            if isinstance(entry, int | float) and not isinstance(entry, bool):
+                yield key, entry
 
 
 def _divisors(number: int) -> list[int]:

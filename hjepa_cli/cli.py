@@ -5,17 +5,18 @@ at once. Defaults live in ``presets/default.toml``, not in the signatures below:
 given is ``None`` and changes nothing.
 """
 
+import contextlib
 import io
 import os
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated, NoReturn
+from typing import Annotated, NoReturn, TextIO
 
 import typer
 from typer.main import get_command
 
-from hjepa_cli import __version__, options, plan
+from hjepa_cli import __version__, options, plan, torchrun
 from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, resolve
 from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
 from hjepa_cli.screen import Screen, one_line
@@ -45,11 +46,20 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # an ASCII-only terminal gets "?", not a crash
             stream.reconfigure(errors="replace")
-    sys.exit(_run_command(argv))
+    if not torchrun.follows():
+        sys.exit(_run_command(argv, sys.stderr))
+    errors = sys.stderr
+    with (
+        open(os.devnull, "w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
+        code = _run_command(argv, errors)
+    sys.exit(code)
 
 
-def _run_command(argv: list[str]) -> int:
-    """Run one command; return the exit code after reporting any error."""
+def _run_command(argv: list[str], errors: TextIO) -> int:
+    """Run one command; return the exit code after reporting any error to ``errors``."""
     try:
         returned = get_command(app).main(argv, prog_name="hjepa", standalone_mode=False)
         return returned if isinstance(returned, int) else 0
@@ -60,7 +70,9 @@ def _run_command(argv: list[str]) -> int:
     if isinstance(failure, PipeClosed):  # keep Python from complaining about its last flush
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return failure.exit_code
-    screen = Screen(json="--json" in argv)
+    if torchrun.follows() and not isinstance(failure, torchrun.OneOfSeveral):
+        return failure.exit_code  # the process that leads says the same
+    screen = Screen(json="--json" in argv, stderr=errors)
     screen.error(failure.message, failure.hint)
     if screen.json:
         message, hint = one_line(failure.message), failure.hint
@@ -153,14 +165,18 @@ def collect(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
-        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.collect import run
 
-        with placed(workers, cluster):
-            return run(settings, screen, out=out)
+        return run(settings, screen, out=out)
 
     execute(
-        screen, stage, lambda: plan.plan_collect(settings, out), dry_run=dry_run, product="dataset"
+        screen,
+        stage,
+        lambda: plan.plan_collect(settings, out),
+        dry_run=dry_run,
+        product="dataset",
+        workers=workers,
+        cluster=cluster,
     )
 
 
@@ -207,6 +223,7 @@ def train_encoder(
         lambda: plan.plan_train_encoder(settings, dataset, out),
         dry_run=dry_run,
         product="checkpoint",
+        shared=True,
     )
 
 
@@ -296,24 +313,24 @@ def evaluate(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
-        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.evaluate import run
 
-        with placed(workers, cluster):
-            return run(
-                settings,
-                screen,
-                checkpoint=checkpoint,
-                dataset=dataset,
-                out=out,
-                remeasure=remeasure,
-            )
+        return run(
+            settings,
+            screen,
+            checkpoint=checkpoint,
+            dataset=dataset,
+            out=out,
+            remeasure=remeasure,
+        )
 
     execute(
         screen,
         stage,
         lambda: plan.plan_eval(settings, checkpoint, dataset, out, remeasure=remeasure),
         dry_run=dry_run,
+        workers=workers,
+        cluster=cluster,
     )
 
 
@@ -379,19 +396,17 @@ def scale(
         snr_db = parse_snr(settings.radio.snr_db)
 
     def stage() -> Result:
-        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.scale import run
 
-        with placed(workers, cluster):
-            return run(
-                settings,
-                screen,
-                checkpoint=checkpoint,
-                dataset=dataset,
-                out=out,
-                remeasure=remeasure,
-                verify=verify,
-            )
+        return run(
+            settings,
+            screen,
+            checkpoint=checkpoint,
+            dataset=dataset,
+            out=out,
+            remeasure=remeasure,
+            verify=verify,
+        )
 
     execute(
         screen,
@@ -400,6 +415,8 @@ def scale(
             settings, checkpoint, dataset, out, snr_db, remeasure=remeasure, verify=verify
         ),
         dry_run=dry_run,
+        workers=workers,
+        cluster=cluster,
     )
 
 
@@ -416,13 +433,11 @@ def resume(
     screen = Screen(quiet, as_json)
 
     def stage() -> Result:
-        from hjepa_cli.core.executors import placed
         from hjepa_cli.stages.resume import run
 
-        with placed(workers, cluster):
-            return run(directory, screen)
+        return run(directory, screen)
 
-    execute(screen, stage)
+    execute(screen, stage, workers=workers, cluster=cluster, shared=True)
 
 
 app.command(rich_help_panel=PIPELINE)(reproduce)

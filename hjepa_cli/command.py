@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from hjepa_cli import plan
+from hjepa_cli import plan, torchrun
 from hjepa_cli.checks import check_settings
 from hjepa_cli.errors import HjepaError, Interrupted, StorageError, UsageError
 from hjepa_cli.interrupts import exit_code, sigterm_raises
@@ -53,6 +53,9 @@ def execute(
     *,
     dry_run: bool = False,
     product: str | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
+    shared: bool = False,
 ) -> None:
     """Run a stage, or show its plan, and print what it returns.
 
@@ -61,12 +64,21 @@ def execute(
         planned: its plan.
         dry_run: show the plan only.
         product: key of the result that a quiet run prints: the path that it made.
+        workers, cluster: where its parallel work goes, as the user said.
+        shared: several processes of torchrun may do it together.
     """
     with guard():
+        if not shared:
+            torchrun.refuse()
         if dry_run and planned is not None:
             planned().show(screen)
             return
-        result = stage()
+        from hjepa_cli.core.executors import placed
+
+        with placed(workers, cluster):
+            result = stage()
+        if torchrun.follows():
+            return
         if screen.json:
             screen.emit(result)
         elif screen.quiet and product is not None:  # otherwise the stage has said where it is

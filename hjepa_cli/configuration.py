@@ -6,7 +6,7 @@ from typing import Any
 
 from hjepa_cli.errors import UsageError
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings, origins
+from hjepa_cli.settings import Settings, dotted, origins
 from hjepa_cli.storage.runs import to_toml
 
 Result = dict[str, Any]
@@ -34,7 +34,7 @@ def show(
         UsageError: no such section or value.
     """
     sources = origins(settings.preset, config, flags)
-    values = flat(settings.as_dict())
+    values = dotted(settings.as_dict())
     named = [name for name in sources if not key or name == key or name.startswith(f"{key}.")]
     shown = [name for name in named if name in values]  # empty lists say nothing
     if not shown:
@@ -53,14 +53,6 @@ def show(
         "preset": settings.preset,
         "values": {name: {"value": values[name], "from": sources[name]} for name in shown},
     }
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted key."""
-    pairs: dict[str, Any] = {}
-    for name, value in values.items():
-        pairs |= flat(value, f"{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-    return pairs
 
 
 def text(value: Any) -> str:

@@ -60,7 +60,8 @@ class Postponed:
 
     def interrupted(self, message: str, hint: str) -> Interrupted:
         """The error to raise for the signal that was kept back."""
-        return Interrupted(message, hint=hint, code=128 + (self._signal or signal.SIGINT))
+        # Without one, another process of the training was stopped: torchrun sends SIGTERM.
+        return Interrupted(message, hint=hint, code=128 + (self._signal or signal.SIGTERM))
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():  # only there it is allowed

@@ -4,7 +4,8 @@ from typing import Any
 
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.screen import Screen
-from hjepa_cli.storage.zoo import ZooModel, list_models, verify_model
+from hjepa_cli.settings import dotted, load_settings
+from hjepa_cli.storage.zoo import CURVES_FILE, ZooModel, list_models, verify_model
 
 Result = dict[str, Any]
 
@@ -37,18 +38,23 @@ def show_info(screen: Screen, name_or_path: str) -> Result:
     """
     model = verify_model(name_or_path)
     metadata = model.metadata
-    rows: list[list[object]] = [[key, value] for key, value in _flat(_summary(model))]
+    rows: list[list[object]] = [[key, value] for key, value in dotted(_summary(model)).items()]
     for key in ("stage", "seed", "dataset", "encoder"):
         if key in metadata:
             rows.append([key, metadata[key]])
     for section in ("architecture", "health", "versions"):
-        rows += [[f"{section}.{key}", value] for key, value in _flat(metadata.get(section))]
+        found = metadata.get(section)
+        if isinstance(found, dict):
+            rows += [[f"{section}.{key}", value] for key, value in dotted(found).items()]
     screen.table(f"Model {model.name}", ["", "value"], rows)
     return {**_summary(model), "metadata": metadata}
 
 
 def verify(screen: Screen, names: list[str]) -> Result:
     """Check models against their sha256, all of the zoo if none is named.
+
+    Also says whether the measured curves beside a model are those of the present defaults, which
+    ``eval`` and ``scale`` would otherwise measure again.
 
     Raises:
         MissingInputError: no such model.
@@ -59,16 +65,41 @@ def verify(screen: Screen, names: list[str]) -> Result:
     for name in names or list_models():
         try:
             model = verify_model(name)
+            missing = missing_curves(model) if model.has_curves else None
         except DataError as error:
             damaged.append(error)
         else:
-            verified.append(_summary(model))
-            screen.result(f"{name}: intact, sha256 {model.digest}")
+            verified.append(_summary(model) | {"missing_curves": missing})
+            screen.result(f"{name}: intact, sha256 {model.digest}{_told(missing)}")
     for further in damaged[1:]:
         screen.say(further.message)
     if damaged:
         raise damaged[0]
     return {"verified": verified}
+
+
+def missing_curves(model: ZooModel) -> list[str]:
+    """The default methods that ``curves.json`` does not hold under the default protocol.
+
+    Raises:
+        DataError: not a model that can drive, or damaged curves.
+    """
+    from hjepa_cli.core.model import Model  # torch: seconds that the other commands need not wait
+    from hjepa_cli.stages.evaluate import Subject
+    from hjepa_cli.storage import curves
+
+    settings = load_settings("gym" if model.metadata.get("plant") == "gym" else None)
+    subject = Subject(settings, Model.load(model.path), model.path, None)
+    found = curves.read(model.path.with_name(CURVES_FILE), subject.digest)
+    return [name for name in subject.measurable(settings.methods) if name not in found]
+
+
+def _told(missing: list[str] | None) -> str:
+    if missing is None:
+        return ""
+    if not missing:
+        return "; its curves are those of the default protocol and methods"
+    return f"; default curves to be measured again: {', '.join(missing)}"
 
 
 def _summary(model: ZooModel) -> Result:
@@ -97,14 +128,3 @@ def _row(model: Result) -> list[object]:
         model["name"], model["kind"], model["plant"], strides, megabytes, curves,
         model["sha256"][:12],
     ]  # fmt: skip
-
-
-def _flat(values: object, prefix: str = "") -> list[tuple[str, object]]:
-    """Nested metadata as (dotted key, value) pairs."""
-    if not isinstance(values, dict):
-        return []
-    pairs: list[tuple[str, object]] = []
-    for key, value in values.items():
-        nested = isinstance(value, dict)
-        pairs += _flat(value, f"{prefix}{key}.") if nested else [(prefix + key, value)]
-    return pairs

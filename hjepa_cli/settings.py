@@ -262,7 +262,19 @@ def origins(
         As :func:`load_settings`.
     """
     layers = _layers(preset or "default", config, flags or {})
-    return {key: source for source, changes in layers for key in _dotted(changes)}
+    return {key: source for source, changes in layers for key in dotted(changes)}
+
+
+def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
+    """Nested values by the path to them: ``{"a": {"b": 1}}`` → ``{"a.b": 1}``."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            below = dotted(value, separator)
+            flat |= {f"{key}{separator}{name}": entry for name, entry in below.items()}
+        else:
+            flat[key] = value
+    return flat
 
 
 def _layers(
@@ -281,15 +293,6 @@ def _layers(
             section, _, field = key.rpartition(".")
             layers.append(("flag", {section: {field: value}} if section else {field: value}))
     return layers
-
-
-def _dotted(values: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Dotted keys of nested values."""
-    keys: list[str] = []
-    for key, value in values.items():
-        nested = isinstance(value, Mapping)
-        keys += _dotted(value, f"{prefix}{key}.") if nested else [prefix + key]
-    return keys
 
 
 def _read_preset(name: str) -> dict[str, Any]:

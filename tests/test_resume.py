@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,7 +17,10 @@ import pytest
 import torch
 from command_line import ENVIRONMENT, Shell, assert_one_line_error, open_shell
 
+from hjepa_cli.core.batches import FrameWindows, TrajectoryBatch
 from hjepa_cli.core.jepa import Jepa
+from hjepa_cli.core.levels import EmbeddedTrajectories
+from hjepa_cli.core.ranks import Ranks
 from hjepa_cli.core.training import Optimiser
 from hjepa_cli.errors import DataError, Interrupted, NumericalError, StorageError, UsageError
 from hjepa_cli.interrupts import Postponed, Terminated, sigterm_raises
@@ -91,12 +95,12 @@ def signal_after(monkeypatch: pytest.MonkeyPatch, steps: int, number: int = sign
     """Send this process a signal in the middle of a training step."""
     update, seen = Optimiser.step, 0
 
-    def step(self: Optimiser, loss: torch.Tensor, index: int) -> None:
+    def step(self: Optimiser, *rest: Any) -> float:
         nonlocal seen
         seen += 1
         if seen == steps:
             os.kill(os.getpid(), number)
-        update(self, loss, index)
+        return update(self, *rest)
 
     monkeypatch.setattr(Optimiser, "step", step)
 
@@ -105,12 +109,12 @@ def crash_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     """Let the step after ``steps`` fail, as a bug or a lack of memory would."""
     update, seen = Optimiser.step, 0
 
-    def step(self: Optimiser, loss: torch.Tensor, index: int) -> None:
+    def step(self: Optimiser, *rest: Any) -> float:
         nonlocal seen
         seen += 1
         if seen > steps:
             raise RuntimeError("crash")
-        update(self, loss, index)
+        return update(self, *rest)
 
     monkeypatch.setattr(Optimiser, "step", step)
 
@@ -338,11 +342,66 @@ def test_a_diverging_run_saves_nothing_that_is_not_finite(
 
     monkeypatch.setattr(Jepa, "total", poisoned)
     monkeypatch.setattr(progress, "SAVE_EVERY_S", 0.0)
+    draw, drawn = FrameWindows.draw, []
+
+    def remember(self: FrameWindows, *rest: Any) -> TrajectoryBatch:
+        drawn.append(draw(self, *rest))
+        return drawn[-1]
+
+    monkeypatch.setattr(FrameWindows, "draw", remember)
     with pytest.raises(NumericalError, match=r"diverged at step 2 .*learning rate") as caught:
         trainer("train-encoder", workplace)(out)
+    assert f"batch: {drawn[2].drawn})" in caught.value.message
     assert caught.value.exit_code == 70
     assert not (out / "model.safetensors").exists()
     assert load_checkpoint(out / PROGRESS_FILE).metadata["step"] == 2
+
+
+def test_a_batch_is_named_by_what_is_in_it() -> None:
+    """8 windows of 4 trajectories whose pixels and actions say which they are, and when."""
+    number, k = torch.arange(4)[:, None], torch.arange(10)
+    frames = (16 * number + torch.arange(11)).to(torch.uint8)
+    windows = FrameWindows(
+        frames[..., None, None, None].expand(4, 11, 2, 2, 3),
+        (100 * number + k).float(),
+        window_frames=3,
+        stride=2,
+        mirror=False,
+    )
+    batch = windows.draw(8, np.random.default_rng(0))
+    first = batch.frames.unflatten(0, (8, 3))[:, 0, 0, 0, 0, 0].tolist()
+    named = re.findall(r"(\d+) from k = (\d+)", batch.drawn)
+    assert [16 * int(row) + int(start) for row, start in named] == first
+    assert len(set(named)) > 4
+
+
+@pytest.mark.parametrize("level", ["high", "medium", "low", "flat"])
+def test_the_levels_name_their_batches_too(
+    level: str, workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[int]] = []
+    choose, add_up = EmbeddedTrajectories.choose, Ranks.add_up
+    loops = dict(zip(("high", "medium", "low", "flat"), (1, 4, 6, 8), strict=True))
+
+    def remember(self: EmbeddedTrajectories, *rest: Any) -> torch.Tensor:
+        seen.append(choose(self, *rest).tolist())
+        return torch.tensor(seen[-1])
+
+    def poison(self: Ranks, tensors: list[torch.Tensor]) -> None:
+        add_up(self, tensors)
+        if len(seen) > loops[level]:
+            tensors[0].fill_(float("nan"))
+
+    monkeypatch.setattr(EmbeddedTrajectories, "choose", remember)
+    monkeypatch.setattr(Ranks, "add_up", poison)
+    with pytest.raises(NumericalError) as caught:
+        trainer("train-hierarchy", workplace)(tmp_path / "run")
+    *_, drawn, again = seen
+    assert drawn == again and len(seen) == loops[level] + 2
+    listed = ", ".join(map(str, drawn))
+    named = f"of 8 (mirror images last) the trajectories {listed})"
+    assert caught.value.message.endswith(named)
+    assert (tmp_path / "run" / PROGRESS_FILE).exists() == (level != "high")
 
 
 def test_signals_inside_and_outside_of_loops() -> None:

@@ -1,5 +1,7 @@
 """Schedules, divergence, device choice and the actor's fit."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -44,6 +46,13 @@ def test_divergence_stops_before_the_weights_are_touched(bad: float) -> None:
     with pytest.raises(NumericalError, match="step 7"):
         optimiser(parameter).step((parameter * bad).sum(), 7)
     assert torch.equal(parameter.detach(), torch.ones(2))
+
+
+def test_a_long_batch_is_named_by_its_beginning() -> None:
+    z = torch.full((60, 4), float("nan"))
+    options = dataclasses.replace(load_settings().actor, batch=50, hidden=8)
+    with pytest.raises(NumericalError, match=r"step 0 .*batch: embeddings \d+,.* and 30 more\)$"):
+        fit_actor(z, torch.zeros(60), options, seed=0)
 
 
 def test_cuda_is_refused_where_there_is_none() -> None:

@@ -16,10 +16,12 @@ class TrajectoryBatch:
     Attributes:
         frames: uint8 [B · F, 2, H, W, 3], (previous, current).
         actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
+        drawn: which windows were drawn, for messages.
     """
 
     frames: Tensor
     actions: Tensor
+    drawn: str = ""
 
 
 def window_indices(
@@ -74,25 +76,33 @@ class FrameWindows:
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
         self.mirrored_actions = torch.tensor(mirrored_actions)
 
-    def draw(self, count: int, generator: np.random.Generator) -> TrajectoryBatch:
-        """``count`` windows from trajectories drawn without replacement where they suffice."""
+    def draw(
+        self, count: int, generator: np.random.Generator, share: slice = slice(None)
+    ) -> TrajectoryBatch:
+        """``count`` windows from trajectories drawn without replacement where they suffice.
+
+        Of these the windows ``share`` are cut out: what is drawn does not depend on it.
+        """
         total = len(self.frames)
         chosen = generator.choice(total, size=count, replace=count > total)
         steps = window_indices(self.steps, self.window_frames, self.stride, generator, count)
-        trajectories = torch.from_numpy(chosen)
-        k = torch.from_numpy(steps)
+        trajectories = torch.from_numpy(chosen[share])
+        k = torch.from_numpy(steps[share])
         actions = stride_actions(self.actions[trajectories], k, self.stride)
         rows = trajectories[:, None]
         pairs = torch.stack([self.frames[rows, k], self.frames[rows, k + 1]], dim=2)
         if self.mirror:
-            flipped = torch.from_numpy(generator.random(count) < 0.5)
+            flipped = torch.from_numpy((generator.random(count) < 0.5)[share])
             pairs[flipped] = pairs[flipped].flip(-2)
             actions[flipped] *= self.mirrored_actions
         if self.shift_px:
             shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)
-            for window, shift_px in zip(pairs, shifts, strict=True):
+            for window, shift_px in zip(pairs, shifts[share], strict=True):
                 window.copy_(shift_sideways(window, int(shift_px)))
-        return TrajectoryBatch(pairs.flatten(0, 1), actions)
+        windows = (f"{row} from k = {k[0]}" for row, k in zip(chosen, steps, strict=True))
+        return TrajectoryBatch(
+            pairs.flatten(0, 1), actions, f"windows of trajectories {', '.join(windows)}"
+        )
 
 
 def shift_sideways(frames: Tensor, shift_px: int) -> Tensor:

@@ -24,6 +24,11 @@ class EmbeddedTrajectories:
         """The first ``count`` trajectories."""
         return EmbeddedTrajectories(self.z[:count], self.actions[:count])
 
+    def choose(self, count: int, generator: np.random.Generator) -> Tensor:
+        """The trajectories [B] of a batch: the first that a loss below draws."""
+        total = len(self.z)
+        return torch.from_numpy(generator.choice(total, size=count, replace=count > total))
+
     def windows(
         self, count: int, frames: int, stride: int, generator: np.random.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -32,8 +37,7 @@ class EmbeddedTrajectories:
         Returns:
             Trajectory indices [B, 1], steps k [B, F] and stride actions [B, F − 1, stride, *A].
         """
-        total, length = self.z.shape[:2]
-        chosen = torch.from_numpy(generator.choice(total, size=count, replace=count > total))
+        chosen, length = self.choose(count, generator), self.z.shape[1]
         k = torch.from_numpy(window_indices(length, frames, stride, generator, count))
         return chosen[:, None], k, stride_actions(self.actions[chosen], k, stride)
 

@@ -2,15 +2,15 @@
 
 A picture flipped left to right shows the plant in its mirrored state, and mirrored forces move that
 one mirrored. The layers here obey this exactly, whatever their weights: nothing that was learned
-on one side has to be learned again on the other, and an upright pole, its own mirror image, gets no
-force at all. Data that is merely flipped at random teaches this only roughly, and the rest is a bias
-that pushes on while no packet arrives (docs/LOG.md).
+on one side has to be learned again on the other, and an upright pole, its own mirror image, gets
+no force at all. Data that is merely flipped at random teaches this only roughly, and the rest is a
+bias that pushes on while no packet arrives (docs/LOG.md).
 
 A mirror does one of two things to a vector. To ``Signs`` it gives or takes minus signs: embeddings,
-of which the first half is even and the second odd, and forces. Of ``Twins`` it swaps the two halves:
-hidden units, and the channels of feature maps, which are flipped as well. Nonlinearities act on
-twins only. A linear map that commutes with the mirror maps even parts to even ones and odd parts to
-odd ones, each on its own (Schur's lemma), at half the multiplications of an arbitrary map.
+of which the first half is even and the second odd, and forces. Of ``Twins`` it swaps the two
+halves: hidden units, and the channels of feature maps, which are flipped as well. Nonlinearities
+act on twins only. A linear map that commutes with the mirror maps even parts to even ones and odd
+parts to odd ones, each on its own (Schur's lemma), at half the multiplications of an arbitrary map.
 """
 
 from collections.abc import Sequence
@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.modules.batchnorm import _BatchNorm
 
 HALF = 0.5**0.5
 
@@ -137,11 +138,8 @@ class MirrorConv2d(nn.Conv2d):
         return layer.eval()
 
 
-class MirrorNorm2d(nn.BatchNorm2d):
-    """Batch norm of twins: one mean, variance, scale and offset for a channel and its twin."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__(channels // 2)
+class TwinsAsOne(_BatchNorm):
+    """Mixed into a batch norm: one mean, variance, scale and offset for a channel and its twin."""
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, channels, H, W] → the same shape."""
@@ -151,16 +149,21 @@ class MirrorNorm2d(nn.BatchNorm2d):
         normed = super().forward(wide.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
         return normed.reshape(n, height, width, channels).permute(0, 3, 1, 2)
 
+
+class MirrorNorm2d(TwinsAsOne, nn.BatchNorm2d):
+    """Batch norm of twins; ``channels`` of both halves."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels // 2)
+
     def ordinary(self) -> nn.BatchNorm2d:
         """The same map, in evaluation mode, as an ordinary batch norm."""
         layer = nn.BatchNorm2d(2 * self.num_features, eps=self.eps).eval()
-        state = self.state_dict()
-        layer.load_state_dict(
-            {
-                key: torch.cat([value, value]) if value.dim() else value
-                for key, value in state.items()
-            }
-        )
+        both = {
+            name: torch.cat([value, value]) if value.dim() else value
+            for name, value in self.state_dict().items()
+        }
+        layer.load_state_dict(both)
         return layer
 
 
@@ -181,6 +184,6 @@ class MirrorCentre(nn.Module):
 
 
 def flatten_twins(x: Tensor) -> Tensor:
-    """Feature maps of twins [N, C, H, W] → twins [N, C · H · W] without a place: none is flipped."""
+    """Feature maps of twins [N, C, H, W] → twins [N, C · H · W] in no place: none is flipped."""
     right, left = x.chunk(2, dim=1)
     return torch.cat([right.flatten(1), left.flip(-1).flatten(1)], dim=-1)

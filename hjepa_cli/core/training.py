@@ -1,17 +1,20 @@
 """What all training loops share: device, precision, optimiser and its schedule."""
 
+import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 
 import torch
 from torch import Tensor, nn
 
 from hjepa_cli.core.actor import Actor
+from hjepa_cli.core.ranks import ALONE, Ranks
 from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.settings import ActorSettings
 
 WARM_UP = 0.3  # share of a one-cycle schedule spent rising
+NAMED = 20  # samples of a batch in a message
 
 
 def resolve_device(name: str) -> torch.device:
@@ -67,6 +70,7 @@ class Optimiser:
         schedule: see :func:`learning_rate_factor`.
         steps: length of the schedule.
         gradient_clip: largest gradient norm; 0 does not clip.
+        ranks: the processes whose losses and gradients are summed.
     """
 
     def __init__(
@@ -79,15 +83,24 @@ class Optimiser:
         learning_rate: float,
         weight_decay: float,
         gradient_clip: float,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.parameters = list(parameters)
         kind = torch.optim.AdamW if name == "adamw" else torch.optim.SGD
         self.inner = kind(self.parameters, lr=learning_rate, weight_decay=weight_decay)
         self.schedule, self.steps, self.peak = schedule, steps, learning_rate
-        self.gradient_clip = gradient_clip
+        self.gradient_clip, self.ranks = gradient_clip, ranks
 
-    def step(self, loss: Tensor, step: int) -> None:
+    def step(self, loss: Tensor, step: int, batch: Callable[[], str] = lambda: "unnamed") -> float:
         """One update at ``step``.
+
+        Args:
+            loss: this process's part of it.
+            step: for the schedule and for messages.
+            batch: names what the loss was taken on, for messages.
+
+        Returns:
+            The loss of all processes.
 
         Raises:
             NumericalError: the loss or its gradient is not finite.
@@ -97,15 +110,19 @@ class Optimiser:
             group["lr"] = rate
         self.inner.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        total = loss.detach().clone()
+        gradients = [value.grad for value in self.parameters if value.grad is not None]
+        self.ranks.add_up([total, *gradients])
         norm = nn.utils.clip_grad_norm_(self.parameters, self.gradient_clip or math.inf)
-        if not torch.isfinite(norm) or not torch.isfinite(loss):
+        if not torch.isfinite(norm) or not torch.isfinite(total):
             raise NumericalError(
-                f"training diverged at step {step} (loss {loss.item():.4g}, "
-                f"gradient norm {norm.item():.4g}, learning rate {rate:.3g})",
+                f"training diverged at step {step} (loss {total.item():.4g}, "
+                f"gradient norm {norm.item():.4g}, learning rate {rate:.3g}, batch: {batch()})",
                 hint="pass --config FILE.toml with a lower learning_rate, "
                 'or with precision = "fp32" in [encoder]',
             )
         self.inner.step()
+        return total.item()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Its moments and step counts, flat: ``<parameter's number>.<name>``."""
@@ -129,6 +146,12 @@ class Optimiser:
             if value.dim():  # in the parameter's memory layout, or the last bits come out otherwise
                 value = torch.empty_like(parameter).copy_(value)
             self.inner.state[parameter][name] = value
+
+
+def name_samples(kind: str, indices: Tensor) -> str:
+    """``embeddings 3, 17, 4 …``: a batch in a message, its beginning if it is long."""
+    shown = ", ".join(str(index) for index in indices[:NAMED].tolist())
+    return f"{kind} {shown}" + (f" and {len(indices) - NAMED} more" * (len(indices) > NAMED))
 
 
 def fit_actor(
@@ -174,5 +197,5 @@ def fit_actor(
             order = torch.randperm(len(z)).to(z.device)
         chosen = order[index * settings.batch : (index + 1) * settings.batch]
         loss = nn.functional.mse_loss(actor(z[chosen]), actions[chosen])
-        optimiser.step(loss, step)
+        optimiser.step(loss, step, functools.partial(name_samples, "embeddings", chosen))
     return actor.eval()

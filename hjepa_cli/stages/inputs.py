@@ -1,9 +1,10 @@
 """What training stages take in: a dataset that fits, rendered frames, versions."""
 
 import dataclasses
+import hashlib
 import platform
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from hjepa_cli import __version__
 from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import encode_frames
 from hjepa_cli.core.plant import plant, plant_of
+from hjepa_cli.core.ranks import ALONE, Ranks
 from hjepa_cli.core.training import resolve_device
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.progress import Progress
@@ -26,7 +28,9 @@ from hjepa_cli.storage.datasets import (
     find_newest_dataset,
     load_dataset,
 )
+from hjepa_cli.storage.files import canonical_json
 from hjepa_cli.storage.runs import Run
+from hjepa_cli.torchrun import ContactLost
 
 CHUNK = 20  # trajectories rendered or encoded at a time: progress shows, memory stays small
 
@@ -148,18 +152,43 @@ def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> Rende
 
 @contextmanager
 def training_run(
-    stage: str, out: Path | None, settings: Settings, inputs: Mapping[str, Any], screen: Screen
+    stage: str,
+    out: Path | None,
+    settings: Settings,
+    inputs: Mapping[str, Any],
+    screen: Screen,
+    ranks: Ranks = ALONE,
 ) -> Iterator[tuple[Run, Progress]]:
     """The run directory of a training stage, its ``result`` set if it is a finished one.
 
     An interrupted run is taken up where its state was saved.
+
+    Raises:
+        DataError: the processes ``ranks`` do not see the same inputs and saved state.
     """
     keep_freed_memory()
-    with Run.create(stage, out, settings.as_dict(), inputs) as record:
-        if record.result is not None:
-            screen.say(f"{record.directory} is finished; this is its result")
-        with Progress(record, screen) as progress:
+    with ExitStack() as stack:
+        with ranks.together():
+            record = stack.enter_context(
+                Run.create(stage, out, settings.as_dict(), inputs)
+                if ranks.leads
+                else Run.follow(out)
+            )
+            if record.result is not None:
+                screen.say(f"{record.directory} is finished; this is its result")
+            progress = stack.enter_context(Progress(record, screen, ranks))
+        digests = [value["sha256"] for value in inputs.values()]
+        seen = canonical_json([settings.as_dict(), digests, progress.state])
+        if len(set(ranks.gather(int(hashlib.sha256(seen.encode()).hexdigest()[:15], 16)))) > 1:
+            raise DataError(
+                "the processes do not see the same settings, dataset and saved state",
+                hint="keep --dataset and --out on a disk that all machines share",
+            )
+        try:
             yield record, progress
+        except ContactLost as lost:
+            lost.hint = record.continue_command if ranks.leads else lost.hint
+            raise
 
 
 def versions() -> dict[str, str]:

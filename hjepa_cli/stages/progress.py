@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hjepa_cli.core.ranks import ALONE, Ranks
 from hjepa_cli.errors import DataError
 from hjepa_cli.interrupts import Postponed
 from hjepa_cli.screen import Screen
@@ -64,13 +65,14 @@ class Progress:
     Args:
         record: the run; its metrics are put back to where the saved state was taken.
         screen: where to say that a run is taken up.
+        ranks: the processes that train; all read the saved state, the first one writes it.
 
     Raises:
         DataError: the saved state is damaged.
     """
 
-    def __init__(self, record: Run, screen: Screen) -> None:
-        self._record, self._opened_s = record, time.monotonic()
+    def __init__(self, record: Run, screen: Screen, ranks: Ranks = ALONE) -> None:
+        self._record, self._ranks, self._opened_s = record, ranks, time.monotonic()
         self._path = record.path(PROGRESS_FILE)
         self._interrupts = Postponed()
         self._saved: Saved | None = None
@@ -91,6 +93,11 @@ class Progress:
         """Spent on this run up to now, over all its interruptions."""
         before = self._saved.seconds if self._saved else 0.0
         return before + time.monotonic() - self._opened_s
+
+    @property
+    def state(self) -> str:
+        """Where the run stands, in words that are the same for all processes."""
+        return f"{self._saved.phase} after step {self._saved.step}" if self._saved else "its start"
 
     def reached(self, phase: str) -> int:
         """Steps of ``phase`` that were done before."""
@@ -124,11 +131,12 @@ class Progress:
         with self._interrupts.postpone() as stopped:
             for step in range(start, total):
                 yield step
+                stop = any(self._ranks.gather(stopped()))  # all stop after the same step
                 due = time.monotonic() - saved_s >= SAVE_EVERY_S
-                if due or stopped() or step + 1 == total:
+                if due or stop or step + 1 == total:
                     self._save(phase, step + 1, parts, stream)
                     saved_s = time.monotonic()
-                if stopped():
+                if stop:
                     raise self._interrupts.interrupted(
                         f"interrupted after step {step + 1} of {total} ({phase}); all is saved",
                         self._record.continue_command,
@@ -137,7 +145,8 @@ class Progress:
 
     def remove(self) -> None:
         """Forget the state: the run is finished."""
-        self._path.unlink(missing_ok=True)
+        if self._ranks.leads:
+            self._path.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         self._interrupts.__enter__()
@@ -154,6 +163,8 @@ class Progress:
     def _save(
         self, phase: str, step: int, parts: Mapping[str, Part], stream: np.random.Generator
     ) -> None:
+        if not self._ranks.leads:
+            return
         tensors = {
             f"{part}.{name}": tensor.detach().cpu().contiguous().numpy()
             for part, state in parts.items()
@@ -174,7 +185,7 @@ class Progress:
     def _read(self, screen: Screen) -> None:
         """Take up the saved state; without one the run begins again, from the same seed."""
         if not os.path.lexists(self._path):
-            self._record.metrics = ""
+            self._restore_metrics("")
             screen.say(f"{self._record.directory} was interrupted before its first save")
             return
         checkpoint = load_checkpoint(self._path)
@@ -186,10 +197,14 @@ class Progress:
         self._tensors = {
             name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()
         }
-        self._record.metrics = saved.metrics
+        self._restore_metrics(saved.metrics)
         if saved.threads != torch.get_num_threads():
             torch.set_num_threads(saved.threads)
         screen.say(f"{self._record.directory}: {saved.phase} goes on after step {saved.step}")
+
+    def _restore_metrics(self, text: str) -> None:
+        if self._ranks.leads:
+            self._record.metrics = text
 
     def _restore(self, parts: Mapping[str, Part], stream: np.random.Generator) -> None:
         assert self._saved is not None

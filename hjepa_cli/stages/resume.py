@@ -6,6 +6,7 @@ The run remembers its settings (``config.toml``) and what it was given (``enviro
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli import torchrun
 from hjepa_cli.checks import check_settings
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
@@ -29,9 +30,12 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
     if not directory.is_dir():
         raise MissingInputError(f"run {directory} does not exist", hint="ls runs/*")
     if (directory / LOG).exists() or (directory / MANIFEST).exists():
+        torchrun.refuse()
         return _collect(directory, screen)
     recorded = read_environment(directory)
     stage, inputs = recorded["stage"], recorded["inputs"]
+    if stage != "train-encoder":
+        torchrun.refuse()
     settings = load_settings(_preset(recorded, directory), directory / CONFIG)
     check_settings(settings)
     dataset = _path(inputs, "dataset")
@@ -70,6 +74,10 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
             remeasure=remeasure,
             verify=bool(inputs.get("verify")),
         )
+    if stage == "reproduce":
+        from hjepa_cli.stages import reproduce
+
+        return reproduce.run(settings, screen, out=directory)
     raise DataError(f"{directory} holds a run of '{stage}', which this hjepa does not know")
 
 

@@ -20,11 +20,13 @@ from hjepa_cli.core.jepa import Jepa
 from hjepa_cli.core.model import build_modules, tensors_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.predictors import Predictor
+from hjepa_cli.core.ranks import ALONE, Ranks, joined
 from hjepa_cli.core.seeding import generator
+from hjepa_cli.core.shared_norm import share_statistics
 from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
+from hjepa_cli.settings import Settings, dotted
 from hjepa_cli.stages.inputs import (
     RenderedSplit,
     check_stride,
@@ -49,17 +51,27 @@ def run(
 ) -> dict[str, Any]:
     """Train, gate and save an encoder; returns the document of ``--json``.
 
+    Under ``torchrun`` several processes share the steps; the first does all the rest.
+
     Raises:
-        UsageError: no such device.
+        UsageError: no such device, or too many processes.
         MissingInputError: no dataset.
         NumericalError: training diverged, or a gate failed (see ``settings.encoder.gate``).
     """
-    resolve_device(settings.device)  # refused before anything is read
-    data = open_dataset(dataset, settings)
-    recorded = {split: data.split(split) for split in ("train", "test")}
-    check_stride(settings.encoder.h, recorded["train"].steps)
+    device = resolve_device(settings.device)  # refused before anything is read
+    with joined(device, settings.encoder.batch_trajectories) as ranks:
+        return _run(settings, screen, dataset, out, ranks)
+
+
+def _run(
+    settings: Settings, screen: Screen, dataset: Path | None, out: Path | None, ranks: Ranks
+) -> dict[str, Any]:
+    with ranks.together():
+        data = open_dataset(dataset, settings)
+        recorded = {split: data.split(split) for split in ("train", "test")}
+        check_stride(settings.encoder.h, recorded["train"].steps)
     inputs = {"dataset": describe_input(data.path, data.digest)}
-    with training_run("train-encoder", out, settings, inputs, screen) as (record, progress):
+    with training_run("train-encoder", out, settings, inputs, screen, ranks) as (record, progress):
         if record.result is not None:
             show_gates(screen, record.result["gates"])
             return record.result
@@ -71,7 +83,9 @@ def run(
         modules = build_modules(architecture, kind.action_shape, kind.force_signs)
         encoder, companion = modules["encoder"], modules["high"]
         assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
-        train_jepa(encoder, companion, train, test, settings, record, progress, screen)
+        train_jepa(encoder, companion, train, test, settings, record, progress, screen, ranks)
+        if not ranks.leads:
+            return {}
 
         screen.say("measuring health on all frames and fitting the probe actor")
         report = examine(encoder, companion, train, test, settings, every=1, epochs=None)
@@ -132,11 +146,14 @@ def train_jepa(
     record: Run,
     progress: Progress,
     screen: Screen,
+    ranks: Ranks = ALONE,
 ) -> None:
     """The training loop; modules are trained in place and left in evaluation mode."""
     options, kind = settings.encoder, plant(settings.plant)
     device = resolve_device(settings.device)
     encoder.fit_standardisation(standardisation_sample(train.frames))
+    if ranks.size > 1:
+        share_statistics(encoder)
     jepa = Jepa(
         encoder,
         companion,
@@ -155,6 +172,7 @@ def train_jepa(
         learning_rate=options.learning_rate,
         weight_decay=options.weight_decay,
         gradient_clip=options.gradient_clip,
+        ranks=ranks,
     )
     windows = FrameWindows(
         train.frames,
@@ -166,6 +184,8 @@ def train_jepa(
         mirrored_actions=kind.mirror,
     )
     stream = generator(settings.seed, STREAM)
+    share = ranks.share(options.batch_trajectories)
+    part = (share.stop - share.start) / options.batch_trajectories  # 1 on a single process
     frames_per_epoch = train.actions.numel()
     epoch_steps = max(frames_per_epoch // (options.batch_trajectories * windows.window_frames), 1)
     parts = jepa.parts() | {"optimiser": optimiser}
@@ -173,14 +193,16 @@ def train_jepa(
     with screen.progress("train-encoder", options.steps, "steps", done=done) as bar:
         for step in progress.steps("jepa", options.steps, parts, stream):
             encoder.train()
-            batch = windows.draw(options.batch_trajectories, stream)
+            batch = windows.draw(options.batch_trajectories, stream, share)
             with autocast(device, options.precision):
-                terms = jepa.losses(batch)
-            loss = jepa.total(terms)
-            optimiser.step(loss, step)
+                terms = {name: part * term for name, term in jepa.losses(batch).items()}
+            loss = optimiser.step(jepa.total(terms), step, lambda batch=batch: batch.drawn)
             jepa.update_target()
-            bar.advance(1, loss=loss.item())
+            bar.advance(1, loss=loss)
             if (step + 1) % epoch_steps == 0:
+                ranks.add_up(list(terms.values()))
+                if not ranks.leads:
+                    continue
                 report = examine(
                     encoder,
                     companion,
@@ -190,7 +212,7 @@ def train_jepa(
                     every=math.gcd(4, options.h),
                 )
                 losses = {f"loss_{name}": term.item() for name, term in terms.items()}
-                record.metric({"step": step + 1, **losses, **flatten(report)})
+                record.metric({"step": step + 1, **losses, **dotted(report, "_")})
     encoder.eval()
 
 
@@ -257,7 +279,7 @@ def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any
         "effective_rank": options.gate_rank,
         "action_sensitivity": options.gate_sensitivity,
     }
-    values = flatten(report)
+    values = dotted(report, "_")
     gates = {
         name: {"value": values[name], "threshold": bound, "passed": values[name] >= bound}
         for name, bound in lower_bounds.items()
@@ -293,17 +315,6 @@ def refuse(gates: dict[str, dict[str, Any]], path: Path) -> None:
         hint="collect more trajectories or train for more steps; --no-gate skips the gate, and "
         f"hjepa train-hierarchy --encoder {path} goes on with this one",
     )
-
-
-def flatten(report: dict[str, Any]) -> dict[str, float]:
-    """Nested health report → flat columns (``probe_r2_x``)."""
-    flat: dict[str, float] = {}
-    for name, value in report.items():
-        if isinstance(value, dict):
-            flat |= {f"{name}_{key}": entry for key, entry in value.items()}
-        else:
-            flat[name] = value
-    return flat
 
 
 def standardisation_sample(frames: Tensor, pairs: int = 512) -> Tensor:

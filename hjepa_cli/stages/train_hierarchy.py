@@ -5,6 +5,7 @@ frozen: every frame is encoded once, and all that follows are small networks on 
 """
 
 import copy
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,13 @@ from hjepa_cli.core.metrics import window_means
 from hjepa_cli.core.model import Model, build_modules, load_modules, tensors_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
-from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
+from hjepa_cli.core.training import (
+    Optimiser,
+    autocast,
+    fit_actor,
+    name_samples,
+    resolve_device,
+)
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
@@ -209,7 +216,7 @@ def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, A
 def embed_all(
     encoder: nn.Module, train: RenderedSplit, settings: Settings, screen: Screen, *, flip: bool
 ) -> list[tuple[EmbeddedTrajectories, Tensor]]:
-    """Embeddings and labels [N, T, *A] of the training frames, and with ``flip`` of their mirror images."""
+    """Embeddings and labels [N, T, *A] of the training frames, with ``flip`` mirrored ones too."""
     device, mirror = resolve_device(settings.device), torch.tensor(plant(settings.plant).mirror)
     views = (False, True) if flip else (False,)
     seen = []
@@ -255,12 +262,16 @@ def train_levels(
     fine_data = join([data.first(options.fine_trajectories) for data in seen])
     device = resolve_device(settings.device)
     high, medium, low, flat = (modules[name] for name in ("high", "medium", "low", "flat"))
-    common = {
-        "horizon_steps": options.rollout_steps,
-        "trajectories": options.batch_trajectories,
-    }
+    count = options.batch_trajectories
+    common = {"horizon_steps": options.rollout_steps, "trajectories": count}
 
-    def fit(name: str, role: str, steps: int, loss: Callable[[Generator], Tensor]) -> None:
+    def fit(
+        name: str,
+        role: str,
+        steps: int,
+        data: EmbeddedTrajectories,
+        loss: Callable[[Generator], Tensor],
+    ) -> None:
         # Every level has its own stream: what one does changes no other.
         stream = generator(settings.seed, STREAM, list(modules).index(name))
         optimiser = Optimiser(
@@ -277,12 +288,14 @@ def train_levels(
         done = progress.reached(name)
         with screen.progress(f"train {name}", steps, "steps", done=done) as bar:
             for step in progress.steps(name, steps, parts, stream):
+                before = stream.bit_generator.state
                 with autocast(device, settings.encoder.precision):
-                    value = loss(stream)
-                optimiser.step(value, step)
-                bar.advance(1, loss=value.item())
+                    drawn = loss(stream)
+                batch = functools.partial(name_batch, data, count, stream, before)
+                value = optimiser.step(drawn, step, batch)
+                bar.advance(1, loss=value)
                 if (step + 1) % REPORT_EVERY == 0 or step + 1 == steps:
-                    record.metric({"level": name, "step": step + 1, "loss": value.item()})
+                    record.metric({"level": name, "step": step + 1, "loss": value})
         modules[name].eval()
 
     def high_loss(stream: Generator) -> Tensor:
@@ -301,12 +314,21 @@ def train_levels(
             flat, coarse_data, 1, starts=options.flat_starts, generator=stream, **common
         )
 
-    fit("high", "coarse", options.coarse_steps, high_loss)
+    fit("high", "coarse", options.coarse_steps, coarse_data, high_loss)
     if h > m:
-        fit("medium", "medium", options.medium_steps, medium_loss)
+        fit("medium", "medium", options.medium_steps, fine_data, medium_loss)
     if m > l:
-        fit("low", "low", options.low_steps, low_loss)
-    fit("flat", "coarse", options.flat_steps, flat_loss)
+        fit("low", "low", options.low_steps, fine_data, low_loss)
+    fit("flat", "coarse", options.flat_steps, coarse_data, flat_loss)
+
+
+def name_batch(
+    data: EmbeddedTrajectories, count: int, stream: Generator, state: dict[str, Any]
+) -> str:
+    """The trajectories that a loss drew from ``stream`` when it was in ``state``, for messages."""
+    stream.bit_generator.state = state
+    chosen = data.choose(count, stream)
+    return name_samples(f"of {len(data.z)} (mirror images last) the trajectories", chosen)
 
 
 def join(seen: list[EmbeddedTrajectories]) -> EmbeddedTrajectories:

@@ -20,9 +20,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
-from hjepa_cli import __version__
+from hjepa_cli import __version__, torchrun
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
 from hjepa_cli.interrupts import exit_code
+from hjepa_cli.settings import dotted
 from hjepa_cli.storage import files, tracking
 
 ROOT = Path("runs")
@@ -95,6 +96,15 @@ class Run:
             raise
         return run
 
+    @classmethod
+    def follow(cls, out: Path | None) -> Self:
+        """What another process of the same training has open, to be read alone."""
+        run = cls(out or ROOT, open(os.devnull, "rb"))
+        run.resumed = out is not None and run.path(CONFIG).exists()
+        if out is not None and run.path(RESULT).exists():
+            run.result = files.read_json(run.path(RESULT))
+        return run
+
     def path(self, name: str) -> Path:
         """Return the path of a file in this directory."""
         return self.directory / name
@@ -127,7 +137,7 @@ class Run:
     @property
     def continue_command(self) -> str:
         """What takes this run up again."""
-        return f"hjepa resume {shlex.quote(str(self.directory))}"
+        return f"{torchrun.program()} resume {shlex.quote(str(self.directory))}"
 
     def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
         """Write ``result.json``, which makes the run a finished one, and return what it holds."""
@@ -313,7 +323,7 @@ def _refuse_foreign(directory: Path, stage: str) -> None:
 
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Name the settings that differ, as ``section.key = old, not new``."""
-    before, after = _flat(old), _flat(files.jsonable(new))
+    before, after = dotted(old), dotted(files.jsonable(new))
     return [
         f"{key} = {before.get(key)!r}, not {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys())
@@ -326,13 +336,6 @@ def _digests(inputs: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: value.get("sha256") for name, value in inputs.items() if isinstance(value, Mapping)
     }
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        flat |= _flat(value, f"{key}.") if isinstance(value, Mapping) else {prefix + key: value}
-    return flat
 
 
 def _toml(value: Any) -> str:
