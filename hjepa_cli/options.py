@@ -553,8 +553,8 @@ Preset = Annotated[
     str | None,
     typer.Option(
         "--preset",
-        help="Named set of values to start from.",
-        metavar="|".join(PRESETS),
+        help=f"Named set of values to start from: {', '.join(PRESETS)}.",
+        metavar="NAME",
         rich_help_panel=SETTINGS,
         show_default="default",
         autocompletion=lambda: list(PRESETS),

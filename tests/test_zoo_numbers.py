@@ -1,0 +1,142 @@
+"""The zoo's numbers: what the cards say, recomputed where that takes seconds."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from hjepa_cli.core import health
+from hjepa_cli.core.methods import build_method
+from hjepa_cli.core.metrics import ratio
+from hjepa_cli.core.model import Model
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.protocol import Point
+from hjepa_cli.core.simulator import Block, Simulator
+from hjepa_cli.core.trajectories import generate
+from hjepa_cli.settings import load_settings
+from hjepa_cli.storage import files, zoo
+
+GAP = 80  # steps between packets, in the cards' table
+DEVICES = 12  # of the 64 on the cards: the same draws
+FRESH_SEED = 20_000  # trajectories that no training has seen
+
+pytestmark = pytest.mark.parametrize("name", zoo.list_models())
+
+
+def settings_of(model):
+    preset = model.metadata["settings"]["preset"]
+    flags = {"protocol.curve_devices": DEVICES, "protocol.bracket_devices": DEVICES}
+    return load_settings(preset, flags=flags)
+
+
+def load(name):
+    return Model.load(zoo.resolve_model(name), "cpu")
+
+
+def card_of(name):
+    return (zoo.zoo_directory() / name / zoo.CARD_FILE).read_text(encoding="utf-8")
+
+
+def rows_of(card):
+    """The closed-loop table by method: column name → cell."""
+    lines = [line for line in card.splitlines() if line.startswith("|")]
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    header = next(row for row in table if row[0] == "method")
+    return {
+        row[0].strip("`"): dict(zip(header, row, strict=True))
+        for row in table[table.index(header) + 2 :]
+        if row[0].startswith("`")
+    }
+
+
+def numbers(cell):
+    """``0.871 (0.821–0.917)`` → [0.871, 0.821, 0.917]."""
+    return [float(number) for number in re.findall(r"\d+(?:\.\d+)?", cell.replace(",", ""))]
+
+
+def agree(cell, *values):
+    """Whether a cell shows these values, rounded to its digits."""
+    digits = max(len(number.partition(".")[2]) for number in re.findall(r"[\d.]+", cell))
+    shown = numbers(cell)
+    assert len(shown) == len(values)
+    return np.allclose(shown, values, atol=0.51 * 10**-digits)
+
+
+def test_the_card_says_what_the_curves_say(name):
+    entries = files.read_json(zoo.zoo_directory() / name / zoo.CURVES_FILE)["methods"]
+    rows = rows_of(card_of(name))
+    assert {"hjepa", "hold", "oracle"} <= rows.keys() <= entries.keys()
+    for method, row in rows.items():
+        entry = entries[method]
+        windows = [key for key in row if key.replace("NMAE ", "").replace("–", "-") in
+                   entry["nmae_windows"]]  # fmt: skip
+        assert len(windows) == 4
+        for key in windows:
+            value = entry["nmae_windows"][key.replace("NMAE ", "").replace("–", "-")]
+            assert agree(row[key], value), (method, key)
+        (point,) = [point for point in entry["gap_curve"] if point["d"] == GAP]
+        assert agree(row[f"score at D = {GAP}"], point["score"], *point["ci95"]), method
+        gap = entry["tolerance_gap_steps"], *entry["tolerance_gap_ci95"]
+        assert agree(row["gap D* [steps]"], *gap), method
+        assert agree(row["delivery p*"], entry["tolerance_p"], *entry["tolerance_p_ci95"]), method
+
+
+def test_a_few_devices_score_as_on_the_card(name):
+    """Their mean lies within three standard errors, those of the card's interval and its n."""
+    model, rows = load(name), rows_of(card_of(name))
+    settings = settings_of(model)
+    simulator = Simulator(settings, model)
+
+    def scores(method, gap):
+        block = Block(method, (Point("gap", gap),), 0, DEVICES)
+        return simulator.run(block, lambda steps: None).score
+
+    teacher = scores("optimal", 1.0)
+    entries = files.read_json(zoo.zoo_directory() / name / zoo.CURVES_FILE)["methods"]
+    for method in ("hjepa", "hold"):
+        score, low, high = numbers(rows[method][f"score at D = {GAP}"])
+        n = entries[method]["n_curve_devices"]
+        standard_error = (high - low) / (2 * 1.96) * np.sqrt(n / DEVICES)
+        measured = float(ratio(scores(method, GAP), teacher[0])[0])
+        assert abs(measured - score) < 3 * standard_error, (method, measured)
+        assert (
+            build_method(method, settings, model).bits_per_transmission
+            == (entries[method]["bits_per_transmission"])
+        )
+
+
+def test_fresh_frames_are_read_as_well_as_the_card_says(name):
+    """A probe and the shipped actor on trajectories that nobody has seen.
+
+    The card's probe was fitted to twenty times the frames, so this one may read a little worse.
+    """
+    model = load(name)
+    kind = plant(model.plant_name)
+    settings = load_settings(
+        model.metadata["settings"]["preset"],
+        flags={"seed": FRESH_SEED, "collect.trajectories": 40, "collect.test_trajectories": 10},
+    )
+
+    def see(split):
+        made = generate(settings, split)
+        now = np.arange(1, made.steps + 1, 4)
+        pairs = made.states[:, np.stack([now - 1, now], axis=1)]
+        frames = kind.camera().render(pairs.reshape(-1, pairs.shape[-1]))
+        z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
+        labels_n = made.teacher_n[:, now - 1].reshape(-1, *kind.action_shape)
+        return z, torch.from_numpy(pairs[:, :, 1].reshape(len(z), -1)), torch.from_numpy(labels_n)
+
+    train_z, train_states, _ = see("train")
+    test_z, test_states, labels_n = see("test")
+    told = model.metadata["health"]
+    r2 = health.probe_r2(train_z, train_states, test_z, test_states, kind.state_names)
+    for state, value in told["probe_r2"].items():
+        assert r2[state] > value - 0.06, (state, r2)
+    assert health.nrmse(model.actor(test_z), labels_n) == pytest.approx(
+        told["actor_nrmse"], abs=0.05
+    )
+    line = next(line for line in card_of(name).splitlines() if line.startswith("| linear probe"))
+    assert agree(line.split("|")[2], *told["probe_r2"].values())
+    line = next(line for line in card_of(name).splitlines() if line.startswith("| actor NRMSE"))
+    assert agree(line.split("|")[2], told["actor_nrmse"])
