@@ -2,9 +2,11 @@
 
 import dataclasses
 import hashlib
+import importlib
 import io
 import os
-import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -12,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import Shell, assert_one_line_error, open_shell
+from command_line import ENVIRONMENT, Shell, assert_one_line_error, open_shell
 
 from hjepa_cli.core import executors
 from hjepa_cli.core.executors import InProcess, finished, open_executor, placed
@@ -50,71 +52,120 @@ def small_shards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(datasets, "SHARD_TRAJECTORIES_WITH_FRAMES", 2)
 
 
+class Cluster:
+    """A Dask scheduler and its workers: processes of their own, started as a user starts them."""
+
+    def __init__(self, directory: Path) -> None:
+        pytest.importorskip("distributed")
+        self._directory, self._running = directory, list[subprocess.Popen[bytes]]()
+        self.file = directory / "scheduler.json"
+        self._start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        self.workers = [self.start_worker() for _ in range(2)]
+
+    def start_worker(self) -> subprocess.Popen[bytes]:
+        """Without a nanny: what is killed stays dead."""
+        return self._start("worker", "--nthreads", "1", "--no-nanny")
+
+    def _start(self, kind: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *options]
+        command += ["--scheduler-file", str(self.file), "--no-dashboard"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen(command, cwd=self._directory, env=ENVIRONMENT, **quiet)
+        self._running.append(process)
+        return process
+
+    def wait(self) -> None:
+        """Until two workers are there."""
+        distributed: Any = importlib.import_module("distributed")
+        while not self.file.exists():
+            time.sleep(0.05)
+        with distributed.Client(scheduler_file=str(self.file), set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+
+    def kill_worker(self, when: Path, unless: Path) -> threading.Thread:
+        """SIGKILL a worker as soon as ``when`` exists; the work must not have ended by then."""
+
+        def kill() -> None:
+            while not when.exists():
+                time.sleep(0.001)
+            worker = self.workers.pop(0)
+            worker.kill()
+            self.midway = not unless.exists()
+            worker.wait()
+
+        thread = threading.Thread(target=kill)
+        thread.start()
+        return thread
+
+    def close(self) -> None:
+        for process in self._running:
+            process.kill()
+            process.wait()
+
+
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
-    """A Dask cluster of two worker processes, started apart from the command."""
-    distributed = pytest.importorskip("distributed")
-    with (
-        executors.anonymous_main(),
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-        ) as started,
-    ):
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    started = Cluster(tmp_path_factory.mktemp("cluster"))
+    try:
         yield started
+    finally:
+        started.close()
 
 
 def contents(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
-def kill_a_worker(cluster: Any, when: Path) -> threading.Thread:
-    """SIGKILL one of its processes as soon as ``when`` exists."""
-    pids = [worker.pid for worker in cluster.workers.values()]
-
-    def kill() -> None:
-        while not when.exists():
-            time.sleep(0.001)
-        os.kill(pids[0], signal.SIGKILL)
-
-    thread = threading.Thread(target=kill)
-    thread.start()
-    return thread
-
-
-def test_a_dataset_is_the_same_from_any_number_of_workers_and_from_a_cluster(cluster: Any) -> None:
-    for name, place in {
+def places(cluster: Cluster) -> dict[str, Any]:
+    """Where parallel work can run, by name; ``killed`` loses one of its two workers."""
+    return {
         "zero": placed(0),
         "two": placed(2),
-        "killed": placed(cluster=cluster.scheduler_address),
-    }.items():
-        killer = kill_a_worker(cluster, Path(name, LOG)) if name == "killed" else None
+        "local": placed(2, "local"),
+        "killed": placed(cluster=str(cluster.file)),
+    }
+
+
+def test_a_dataset_is_the_same_from_any_number_of_workers_and_from_a_cluster(
+    cluster: Cluster,
+) -> None:
+    for name, place in places(cluster).items():
+        killer = None
+        if name == "killed":
+            cluster.wait()
+            killer = cluster.kill_worker(Path(name, LOG), Path(name, datasets.MANIFEST))
         with place:
             collect.run(SETTINGS, SCREEN, out=Path(name))
         if killer:
             killer.join()
+            assert cluster.midway
         assert len(list(Path(name).glob("shard-*"))) == 5 + 2 + 1
         assert contents(Path(name)) == contents(Path("zero"))
 
 
-def test_a_sweep_is_the_same_from_any_number_of_workers_and_from_a_cluster(cluster: Any) -> None:
-    """50 signal-to-noise ratios by 4 methods: 200 cells, one CSV."""
-    found = set()
-    for name, place in {
-        "zero": placed(0),
-        "two": placed(2),
-        "killed": placed(cluster=cluster.scheduler_address),
-    }.items():
-        out = Path(name)
-        killer = kill_a_worker(cluster, out / "curves.json") if name == "killed" else None
+def test_a_sweep_is_the_same_from_any_number_of_workers_and_from_a_cluster(
+    cluster: Cluster,
+) -> None:
+    """50 signal-to-noise ratios by 4 methods: 200 cells, four times the same CSV."""
+    if len(cluster.workers) < 2:
+        cluster.workers.append(cluster.start_worker())
+    found = []
+    for name, place in places(cluster).items():
+        out, killer = Path(name), None
+        if name == "killed":
+            cluster.wait()
+            killer = cluster.kill_worker(out / "curves.json", out / "result.json")
         with place:
             result = scale.run(
                 SETTINGS, SCREEN, checkpoint="desktop-h4m2l1", out=out, remeasure=True
             )
         if killer:
             killer.join()
+            assert cluster.midway
         assert len(result["rows"]) == 200
-        found.add((out / "devices.csv").read_bytes())
-    assert len(found) == 1
+        found.append((out / "devices.csv").read_bytes())
+    assert len(found) == 4 and len(set(found)) == 1
+    assert len(found[0].splitlines()) == 201
 
 
 def test_units_come_back_few_at_a_time() -> None:

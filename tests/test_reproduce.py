@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from command_line import assert_one_line_error, open_shell
 
-from hjepa_cli.errors import NumericalError
+from hjepa_cli.errors import Interrupted, NumericalError
 from hjepa_cli.stages import (
     collect,
     evaluate,
@@ -33,9 +33,11 @@ def calls(monkeypatch):
 
     def install(name, module):
         def run(settings, screen, **inputs):
-            made.append((name, inputs))
+            made.append((name, {"settings": settings, **inputs}))
             if failing == [name]:
                 raise NumericalError("the encoder failed its gate", hint="h")
+            if failing == [f"interrupt {name}"]:
+                raise Interrupted("interrupted", hint=f"hjepa resume f/{name}")
             return {"stage": name}
 
         monkeypatch.setattr(module, "run", run)
@@ -78,6 +80,20 @@ def test_what_stops_a_stage_stops_here_and_the_same_command_goes_on(shell, calls
     assert [event.get("stage") for event in events if event["event"] == "finished"] == ["collect"]
     calls[0].clear()
     assert shell("reproduce", "--out", "f", "--quiet").out == "f/report.html\n"
+
+
+def test_an_interrupted_reproduction_is_resumed_as_a_whole(shell, calls):
+    """Not the stage alone that was interrupted; with the same settings, and no other flag."""
+    calls[0].append("interrupt train-hierarchy")
+    stopped = shell("reproduce", "--preset", "smoke", "--seed", "3", "--out", "f", "--quiet")
+    assert_one_line_error(stopped, 130, "hint: hjepa resume f\n")
+    calls[0].clear()
+    resumed = shell("resume", "f", "--json").document
+    assert resumed["report"] == "f/report.html" and set(ORDER) <= resumed.keys()
+    assert [name for name, _ in calls[1:]] == ORDER[:3] + ORDER
+    assert calls[1][1] == calls[4][1]  # what collect was given, settings included
+    assert calls[1][1]["settings"].seed == 3
+    assert shell("resume", "f", "--json").document == resumed  # finished: told again
 
 
 @pytest.mark.parametrize("preset", ["default", "paper", "smoke", "gym"])

@@ -480,7 +480,7 @@ def test_a_real_process_saves_and_says_how_to_go_on(workplace: Path, tmp_path: P
         second = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True)
         assert second.returncode == 75, second
         child.send_signal(signal.SIGINT)
-        _, errors = child.communicate(timeout=60)
+        _, errors = child.communicate(timeout=600)
     assert child.returncode == 130, errors
     assert "all is saved" in errors and "hint: hjepa resume run\n" in errors
     saved = load_checkpoint(tmp_path / "run" / PROGRESS_FILE).metadata

@@ -2,12 +2,16 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.models import missing_curves, verify
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import load_settings
 from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 
@@ -114,5 +118,32 @@ def test_shipped_models_are_whole() -> None:
     assert folders == zoo.list_models()
     for name in folders:
         assert zoo.verify_model(name).has_curves
+        model = zoo.verify_model(name)
+        assert missing_curves(model) == [], "measure them again: hjepa eval --remeasure"
+        methods = set(json.loads((root / name / zoo.CURVES_FILE).read_text())["methods"])
+        assert methods >= set(load_settings().methods)
         card = (root / name / zoo.CARD_FILE).read_text(encoding="utf-8")
         assert card.startswith("---\n"), "a card begins with YAML front matter"
+
+
+def test_verify_says_which_curves_are_not_those_of_the_defaults(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (name, *_) = zoo.list_models()
+    model = Path(shutil.copytree(zoo.zoo_directory() / name, tmp_path / "model"))
+    curves = json.loads((model / zoo.CURVES_FILE).read_text())
+    methods = list(load_settings().methods)
+    for change, missing in (
+        ({}, []),
+        ({"methods": {k: v for k, v in curves["methods"].items() if k != "hold"}}, ["hold"]),
+        ({"digest": curves["digest"] | {"protocol": "0" * 64}}, methods),
+        ({"digest": curves["digest"] | {"loop_version": 0}}, methods),
+    ):
+        (model / zoo.CURVES_FILE).write_text(json.dumps(curves | change))
+        (verified,) = verify(Screen(), [str(model)])["verified"]
+        assert verified["missing_curves"] == missing
+        said = capsys.readouterr().out
+        assert (", ".join(missing) or "those of the default protocol and methods") in said
+    (model / zoo.CURVES_FILE).unlink()
+    (verified,) = verify(Screen(), [str(model)])["verified"]
+    assert verified["missing_curves"] is None and "default" not in capsys.readouterr().out

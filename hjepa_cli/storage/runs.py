@@ -160,6 +160,8 @@ class Run:
     ) -> None:
         self.close()
         files.point_to(self.continue_command, error)
+        if isinstance(error, Interrupted):  # of a run inside this one, perhaps
+            error.hint = self.continue_command
         if isinstance(error, KeyboardInterrupt):
             raise Interrupted(
                 "interrupted; what is finished is kept",
