@@ -27,13 +27,13 @@ class LoadPoint:
     """One simulated load.
 
     Attributes:
-        load: devices per block.
+        load: devices per block; whole where a search asks for it.
         blocks: J.
         outcome: of ``load · blocks`` devices.
         reference: the teacher's score of the same devices [N].
     """
 
-    load: int
+    load: float
     blocks: int
     outcome: CellOutcome
     reference: Floats
@@ -65,6 +65,7 @@ class SupportedLoad:
         at_least: still acceptable at the largest load tried.
         packets_per_slot, reports_per_slot: per block, at the nearest load inside.
         points: (load, score) as simulated, ascending.
+        parts: of each seed, where this is an average over seeds.
     """
 
     load: float
@@ -72,12 +73,13 @@ class SupportedLoad:
     at_least: bool
     packets_per_slot: float
     reports_per_slot: float
-    points: tuple[tuple[int, float], ...]
+    points: tuple[tuple[float, float], ...]
+    parts: tuple["SupportedLoad", ...] = ()
 
 
-def blocks_for(load: int) -> int:
+def blocks_for(load: float) -> int:
     """J, so that about :data:`BLOCK_DEVICES` devices are simulated."""
-    return max(1, BLOCK_DEVICES // load)
+    return max(1, int(BLOCK_DEVICES // load))
 
 
 def find_load(
@@ -130,7 +132,19 @@ def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
         packets_per_slot=float(np.mean([one.packets_per_slot for one in found])),
         reports_per_slot=float(np.mean([one.reports_per_slot for one in found])),
         points=tuple(point for one in found for point in one.points),
+        parts=tuple(found),
     )
+
+
+def pooled_score(
+    points: Sequence[LoadPoint], replicates: int, seed: int
+) -> tuple[float, tuple[float, float]]:
+    """Normalised score of one load over the devices of all seeds, with its 95 % interval."""
+    score = np.concatenate([point.outcome.score for point in points])
+    reference = np.concatenate([point.reference for point in points])
+    weights = metrics.bootstrap_weights(len(score), replicates, seed)
+    low, high = metrics.interval(metrics.ratio(score, reference, weights))
+    return float(metrics.ratio(score, reference)), (float(low), float(high))
 
 
 def _crossing(
