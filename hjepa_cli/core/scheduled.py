@@ -89,6 +89,7 @@ def find_load(
     *,
     replicates: int,
     seed: int,
+    start: float | None = None,
 ) -> SupportedLoad:
     """Bisect the load on a logarithmic scale, at most 8 times.
 
@@ -98,11 +99,18 @@ def find_load(
         bracket: relative width at which to stop.
         replicates, seed: of the bootstrap over devices. It takes devices as independent; they share
             blocks, so that several seeds say more.
+        start: a load near the one to find, like that of another seed: fewer to simulate.
     """
     points: dict[int, LoadPoint] = {}
-    low, high = 1, MAX_LOAD
+    low, high, step = 1, MAX_LOAD, 1 + 4 * bracket
     for _ in range(MAX_BISECTIONS):
-        middle = round(math.sqrt(low * high)) if points else round(math.sqrt(high))
+        if not points:
+            middle = min(round(start or math.sqrt(high)), high)
+        elif start and not (low in points and high in points):
+            middle = round(high / step) if high in points else round(low * step)
+            middle, step = min(max(middle, 1), MAX_LOAD), step**2
+        else:
+            middle = round(math.sqrt(low * high))
         if middle in points:
             middle = min({low, high} - points.keys(), default=0)
         if not middle:

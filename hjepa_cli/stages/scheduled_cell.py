@@ -1,5 +1,6 @@
 """Blocks of loops on a scheduled uplink: simulated for every method, scheduler and SNR once."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -7,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.core.cell import Row
-from hjepa_cli.core.cell_loop import measure_growth, simulate_cell
+from hjepa_cli.core.cell_loop import measure_growth, measure_levels, simulate_cell
 from hjepa_cli.core.channel import thermal_noise_dbm
 from hjepa_cli.core.coding import packet_uses
+from hjepa_cli.core.disagreement import Levels
 from hjepa_cli.core.growth import Growth
 from hjepa_cli.core.hall import drop_devices, power_margin_db
 from hjepa_cli.core.loop import Draws, Floats, every_step, simulate
@@ -48,6 +50,7 @@ class ScheduledCell:
         self._plant = plant(subject.settings.plant)
         self._methods: dict[str, Method] = {}
         self._growth: dict[tuple[str, int], Growth] = {}
+        self._levels: dict[tuple[str, int], Levels] = {}
         self._teacher: dict[int, Floats] = {}
         self._loads: dict[tuple[str, str, float], SupportedLoad] = {}
 
@@ -149,11 +152,16 @@ class ScheduledCell:
         """The load a block carries; without a topology it is the same at every SNR."""
         key = (name, scheduler, snr_db if self._settings.radio.topology == "hall" else 0.0)
         if key not in self._loads:
-            found = [self._search(name, scheduler, snr_db, seed) for seed in self._seeds]
+            found: list[SupportedLoad] = []
+            for seed in self._seeds:
+                near = found[-1].load if found else None
+                found.append(self._search(name, scheduler, snr_db, seed, near))
             self._loads[key] = combine(found)
         return self._loads[key]
 
-    def _search(self, name: str, scheduler: str, snr_db: float, seed: int) -> SupportedLoad:
+    def _search(
+        self, name: str, scheduler: str, snr_db: float, seed: int, near: float | None
+    ) -> SupportedLoad:
         protocol = self._settings.protocol
         label = f"{name}, {scheduler}, seed {seed}"
         with self._screen.progress(label, MAX_BISECTIONS, "loads") as bar:
@@ -169,6 +177,7 @@ class ScheduledCell:
                 protocol.bracket,
                 replicates=protocol.bootstrap,
                 seed=seed,
+                start=near,
             )
 
     def _simulate(
@@ -177,6 +186,10 @@ class ScheduledCell:
         radio, blocks = self._settings.radio, blocks_for(load)
         devices = round(load * blocks)
         margin_db, k_factor_db = self._links(snr_db, seed, devices)
+        method, levels = self._method(name), None
+        if radio.uncertainty == "levels" and method.two_levels:
+            method = dataclasses.replace(method, controller=method.two_levels)
+            levels = self._levels_of(name, method, seed)
         access = Access(
             scheduler=scheduler,
             blocks=blocks,
@@ -184,12 +197,12 @@ class ScheduledCell:
             k_factor_db=k_factor_db,
             coherence_slots=radio.coherence_slots,
             block_error=radio.block_error,
-            growth=self._growth_of(name, seed),
+            growth=levels.growth if levels else self._growth_of(name, seed),
             seed=seed,
+            levels=levels,
         )
-        outcome = simulate_cell(
-            self._plant, self._settings.protocol, seed, devices, access, self._method(name)
-        )
+        protocol = self._settings.protocol
+        outcome = simulate_cell(self._plant, protocol, seed, devices, access, method)
         return LoadPoint(devices / blocks, blocks, outcome, self._reference(seed, devices))
 
     def _links(self, snr_db: float, seed: int, devices: int) -> tuple[float | Floats, Any]:
@@ -215,6 +228,13 @@ class ScheduledCell:
                 self._plant, self._settings.protocol, seed + CALIBRATION_SEED, self._method(name)
             )
         return self._growth[name, seed]
+
+    def _levels_of(self, name: str, method: Method, seed: int) -> Levels:
+        if (name, seed) not in self._levels:
+            self._levels[name, seed] = measure_levels(
+                self._plant, self._settings.protocol, seed + CALIBRATION_SEED, method
+            )
+        return self._levels[name, seed]
 
     def _reference(self, seed: int, devices: int) -> Floats:
         """The teacher's score of the first devices, on the true state at every step."""
