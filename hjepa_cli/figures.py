@@ -68,6 +68,23 @@ STYLES = {
 }
 OTHERS = [Style("#56B4E9", marker, "--") for marker in "PX<>phd*"]
 
+SCHEDULER_STYLES = {
+    "round-robin": Style("#7F7F7F", "s", ":", hollow=True),
+    "opportunistic": Style("#E69F00", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
+    "max-aoi": Style("#009E73", "^", "-."),
+    "drift-plus-penalty": Style("#CC79A7", "v", "--", hollow=True),
+    "whittle": Style("#D55E00", "s", "--"),
+    "innovation": Style("#0072B2", "o"),
+}
+
+
+def scale_figure(result: Mapping[str, Any], *, title: str = "") -> Figure:
+    """Draw what ``scale --json`` counted, as fits its law."""
+    if result["law"] == "scheduled":
+        return schedulers_figure(result["rows"], title=title)
+    snr_label = "Target SNR (dB)" if result["law"] == "duty" else "Mean SNR (dB)"
+    return devices_figure(result["rows"], title=title, snr_label=snr_label)
+
 
 def devices_figure(
     rows: Sequence[Mapping[str, Any]], *, title: str = "", snr_label: str = "Target SNR (dB)"
@@ -98,6 +115,51 @@ def devices_figure(
             axes.set_xticks(grid_db)
         axes.grid(visible=True)
         figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=2.4)
+        return figure
+
+
+def schedulers_figure(rows: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
+    """Draw supported devices against the SNR under each scheduler: a panel per method.
+
+    Schedulers lie side by side at each SNR, so that intervals of equally good ones stay apart.
+
+    Args:
+        rows: of ``scale --law scheduled --json``.
+        title: one line above the panels.
+    """
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    schedulers = [name for name in SCHEDULER_STYLES if name in {row["scheduler"] for row in rows}]
+    grid_db = sorted({row["snr_db"] for row in rows})
+    apart_db = 0.06 * min(np.diff(grid_db), default=1.0)
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(WIDTH_IN, 0.9 + 1.5 * len(methods)), layout="constrained")
+        panels = figure.subplots(len(methods), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, method in zip(panels, methods, strict=True):
+            for place, scheduler in enumerate(schedulers):
+                mine = [
+                    {
+                        **row,
+                        "snr_db": row["snr_db"] + apart_db * (place - len(schedulers) / 2 + 0.5),
+                    }
+                    for row in rows
+                    if (row["method"], row["scheduler"]) == (method, scheduler)
+                ]
+                _bars(axes, scheduler, _curves(mine)[method], SCHEDULER_STYLES[scheduler])
+            axes.set_ylim(bottom=0)
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+            axes.set_ylabel("Devices")
+            axes.annotate(
+                method, (0.02, 0.96), xycoords="axes fraction", va="top", fontweight="bold"
+            )
+            axes.grid(visible=True, axis="y")
+        panels[0].set_title(title)
+        panels[-1].set_xlabel("Target SNR (dB)")
+        if len(grid_db) <= MARKERS:
+            panels[-1].set_xticks(grid_db)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(
+            handles, labels, loc="outside lower center", ncols=2, frameon=False, handlelength=2.4
+        )
         return figure
 
 
@@ -150,6 +212,25 @@ def _draw(axes: Axes, label: str, points: np.ndarray, style: Style) -> None:
         axes.fill_between(snr_db, low, high, color=style.colour, alpha=0.18, linewidth=0)
     else:
         axes.vlines(snr_db, low, high, color=style.colour)
+
+
+def _bars(axes: Axes, label: str, points: np.ndarray, style: Style) -> None:
+    """A line through counts with their intervals as bars [points, (snr, devices, low, high)]."""
+    snr_db, devices, low, high = points.T
+    axes.errorbar(
+        snr_db,
+        devices,
+        yerr=np.maximum([devices - low, high - devices], 0),
+        color=style.colour,
+        linestyle=style.line,
+        linewidth=0.7,
+        marker=style.marker,
+        markerfacecolor="white" if style.hollow else style.colour,
+        markersize=3.5,
+        elinewidth=0.9,
+        capsize=1.5,
+        label=label,
+    )
 
 
 def _scale_counts(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:

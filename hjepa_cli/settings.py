@@ -181,6 +181,7 @@ class RadioSettings:
     bandwidth_hz: float
     noise: Literal["fixed", "scaled"]
     schedulers: tuple[str, ...]  # the rest is for the law "scheduled"
+    uncertainty: Literal["age", "levels"]
     seeds: int
     power_margin_db: float
     coherence_slots: float

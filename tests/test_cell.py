@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from hjepa_cli.core.cell import Cell, Need, gain, ratio_interval
+from hjepa_cli.core.cell import Cell, Need, gain, ratio_interval, ratio_of
 
 LIMIT_BITS_PER_S = 9.169826295 / math.log(2)
 
@@ -132,6 +133,21 @@ def test_ratio_interval_covers_the_true_ratio_19_times_in_20():
         )
         inside += low <= a / b <= high
     assert inside / 20_000 == pytest.approx(0.95, abs=0.01)
+
+
+def test_counts_of_the_same_seeds_are_compared_seed_by_seed():
+    shared = np.array([0.8, 1.0, 1.3, 0.9, 1.1])  # hard and easy draws move both
+    rows = [
+        {"devices": 100, "devices_ci95": [70, 130], "devices_by_seed": list(size * shared * noise)}
+        for size, noise in ((150, [1.01, 0.99, 1.0, 1.02, 0.98]), (100, np.ones(5)))
+    ]
+    low, high = ratio_of(*rows)["ratio_ci95"]
+    logs = np.log([1.515, 1.485, 1.5, 1.53, 1.47])
+    low_log, high_log = stats.t.interval(0.95, 4, logs.mean(), stats.sem(logs))
+    assert (low, high) == pytest.approx((math.exp(low_log), math.exp(high_log)))
+    # One seed, or another number of them: the intervals of the counts decide.
+    wide = ratio_of(rows[0] | {"devices_by_seed": [100]}, rows[1] | {"devices_by_seed": [100]})
+    assert wide["ratio_ci95"][1] - wide["ratio_ci95"][0] > 10 * (high - low)
 
 
 def test_ratio_interval_limits():

@@ -257,6 +257,14 @@ def test_loads_are_found_in_eight_bisections(crossing):
     assert found.packets_per_slot == 1.0 and found.reports_per_slot == 0.1
 
 
+@pytest.mark.parametrize("start", [0.0, 1.0, 30.0, 41.5, 60.0, 500.0])
+def test_a_load_near_the_one_to_find_saves_simulations(start):
+    calls = []
+    found = find_load(curve(41.5, calls), 0.62, 0.03, replicates=50, seed=0, start=start)
+    assert found.load == pytest.approx(41.5, abs=1e-6)
+    assert len(calls) == len(set(calls)) <= (4 if 0.8 < start / 41.5 < 1.2 else MAX_BISECTIONS)
+
+
 def test_loads_beyond_the_range():
     calls = []
     most = find_load(curve(5000.0, calls), 0.62, 0.03, replicates=50, seed=0)

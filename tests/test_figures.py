@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from hjepa_cli.checks import SCHEDULERS
 from hjepa_cli.errors import UsageError
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -166,3 +167,34 @@ def test_bounds_are_named_as_such() -> None:
     measured = [{**row, "at_least": row["method"] == "oracle"} for row in rows()]
     assert "oracle (at least)" in lines(figures.devices_figure(measured))
     assert "hjepa" in lines(figures.devices_figure(measured))
+
+
+def scheduled_rows(methods=("hjepa", "hold"), snr_db=(10.0, 20.0, 30.0)):
+    return [
+        {**row, "method": method, "scheduler": row["method"]}
+        for method in methods
+        for row in rows(list(figures.SCHEDULER_STYLES), snr_db=snr_db)
+    ]
+
+
+@pytest.mark.parametrize("snr_db", [(10.0, 20.0, 30.0), (20.0,)])
+def test_every_scheduler_is_a_line_in_its_method_s_panel(snr_db):
+    result = {"law": "scheduled", "rows": scheduled_rows(snr_db=snr_db)}
+    figure = figures.scale_figure(result, title="a cell")
+    assert len(figure.axes) == 2 and figure.axes[0].get_title() == "a cell"
+    for axes in figure.axes:
+        drawn = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+        assert list(drawn) == list(figures.SCHEDULER_STYLES)
+        for rank, bars in enumerate(drawn.values()):
+            line, _, (interval,) = bars.lines
+            assert list(line.get_ydata()) == [int(100 * (rank + 1) * snr) for snr in snr_db]
+            assert np.abs(line.get_xdata() - np.array(snr_db)).max() < 2  # apart, but at its SNR
+            ends = np.array([segment[:, 1] for segment in interval.get_segments()])
+            assert ends == pytest.approx(np.outer(line.get_ydata(), [0.9, 1.1]), abs=1)
+
+
+def test_schedulers_differ_without_colour():
+    looks = {
+        (style.marker, str(style.line), style.hollow) for style in figures.SCHEDULER_STYLES.values()
+    }
+    assert len(looks) == len(SCHEDULERS) and set(figures.SCHEDULER_STYLES) == set(SCHEDULERS)

@@ -93,13 +93,21 @@ def test_gains_stand_beside_the_papers(stage):
     assert [(gain["over"], gain["snr_db"]) for gain in result["gains"]] == [
         ("ts-jepa-1", 20.0),
         ("hold", 20.0),
+        ("oracle", 20.0),
     ]
     assert result["gains"][0]["ratio"] == pytest.approx(1.12, abs=1e-3)
     printed = stage.out.getvalue()
     assert "hjepa over ts-jepa-1 at 20 dB: +12.0 % devices (95 % CI " in printed
-    assert printed.count("the paper: up to +42.83 %") == 2
+    assert printed.count("the paper: up to +42.83 %") == 3
     assert stage(snr="10:15")["gains"][0]["snr_db"] == 15.0  # the highest, where 20 dB is not asked
     assert stage(methods=("hold", "zero"))["gains"] == []
+
+
+def test_the_best_flat_predictor_is_a_rival(stage, monkeypatch):
+    monkeypatch.setitem(ENTRIES, "ts-jepa-4", entry(gap=120.0, p=0.02))
+    found = {gain["over"]: gain["ratio"] for gain in stage(methods=tuple(ENTRIES))["gains"]}
+    assert list(found) == ["ts-jepa-1", "ts-jepa-4", "hold", "oracle"]
+    assert found["ts-jepa-4"] == pytest.approx(112 / 120, abs=1e-3)
 
 
 def test_the_laws_differ(stage):

@@ -14,10 +14,10 @@ from hjepa_cli.core.loop import Draws, every_step, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.uplink import report_bits
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
-from hjepa_cli.stages import scale
+from hjepa_cli.stages import report, scale, scheduled, scheduled_cell
 
 SMALL = {"protocol.steps": 150, "protocol.bracket": 0.2, "protocol.bootstrap": 200}
 
@@ -78,7 +78,7 @@ def test_document_table_and_reports(stage):
     (found,) = result["gains"]
     assert found["ratio"] == ours["devices"] / turns["devices"]
     printed = stage.out.getvalue()
-    assert "hold-true, innovation" in printed and "over round-robin at 20 dB" in printed
+    assert "hold-true, innovation" in printed and "over hold-true, round-robin at 20 dB" in printed
     with open(result["csv"]) as file:
         assert [int(row["devices"]) for row in csv.DictReader(file)] == [
             row["devices"] for row in result["rows"]
@@ -108,10 +108,67 @@ def test_a_slot_too_small_for_a_packet_is_said(stage):
 
 
 def test_what_cannot_be_scheduled(stage):
-    with pytest.raises(UsageError, match="simulates every count"):
-        stage("hold-true", verify=True)
     with pytest.raises(MissingInputError, match="nothing to schedule"):
         stage("optimal")
+
+
+def test_verify_simulates_both_sides_of_each_load(stage, monkeypatch):
+    monkeypatch.setattr(scheduled_cell, "VERIFY_AT", (0.7, 1.4))  # 150 steps fall off slowly
+    result = stage("hold-true", schedulers=["round-robin"], seeds=2, verify=True, snr_db="10:20:10")
+    (row, _), (inner, outer) = result["rows"], result["verify"]  # the load is that of every SNR
+    assert (inner["expected"], outer["expected"]) == ("above", "below")
+    assert inner["score"] > inner["ci95"][0] > 0.62 > outer["ci95"][1] > outer["score"]
+    for check, share in ((inner, 0.7), (outer, 1.4)):
+        assert check["load"] == pytest.approx(share * row["load_per_block"], rel=0.02)
+    assert stage.out.getvalue().count(" verified") == 2
+
+
+def test_verify_fails_where_the_interval_decides_nothing(stage, monkeypatch):
+    monkeypatch.setattr(scheduled_cell, "VERIFY_AT", (0.95,))
+    with pytest.raises(NumericalError, match=r"hold-true, round-robin at 0\.95 x"):
+        stage("hold-true", schedulers=["round-robin"], verify=True, snr_db="20")
+
+
+def test_loads_of_two_seeds_are_compared_seed_by_seed(stage):
+    """Both have the same fades and gusts, so the ratio is known better than either load."""
+    result = stage("hold-true", schedulers=["round-robin", "max-aoi"], seeds=2, snr_db="20")
+    turns, ages = (row["devices_by_seed"] for row in result["rows"])
+    (found,) = result["gains"]
+    assert (found["method"], found["over"]) == ("hold-true, max-aoi", "hold-true, round-robin")
+    ratios = [age / turn for age, turn in zip(ages, turns, strict=True)]
+    low, high = found["ratio_ci95"]
+    assert low < min(ratios) <= max(ratios) < high
+    assert math.sqrt(low * high) == pytest.approx(math.sqrt(ratios[0] * ratios[1]))
+
+
+def test_gains_name_the_best_rivals():
+    rows = [
+        {"snr_db": 20.0, "method": m, "scheduler": s, "devices": n, "devices_ci95": [n - 5, n + 5]}
+        for m, counts in {
+            "hjepa": (100, 150),
+            "ts-jepa-1": (90, 120),
+            "ts-jepa-4": (95, 110),
+            "hold": (0, 0),
+            "oracle": (120, 200),
+        }.items()
+        for s, n in zip(("round-robin", "innovation"), counts, strict=True)
+    ]
+    found = {(gain["method"], gain["over"]): gain["ratio"] for gain in scheduled.gains(rows, 20.0)}
+    assert found == {
+        ("hjepa, innovation", "hjepa, round-robin"): 1.5,
+        ("ts-jepa-1, innovation", "ts-jepa-1, round-robin"): 120 / 90,
+        ("ts-jepa-4, innovation", "ts-jepa-4, round-robin"): 110 / 95,
+        ("oracle, innovation", "oracle, round-robin"): 200 / 120,
+        ("hjepa, innovation", "ts-jepa-1, innovation"): 150 / 120,
+        ("hjepa, innovation", "oracle, innovation"): 0.75,
+    }
+    assert scheduled.gains(rows, 10.0) == []
+
+
+def test_a_report_shows_every_scheduler(stage):
+    result = stage("hold-true", schedulers=["round-robin", "max-aoi"], snr_db="20")
+    shown = "".join(report.scale_section(result))
+    assert "hold-true, max-aoi" in shown and "over hold-true, round-robin at 20 dB" in shown
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+from scipy import stats
+
 from hjepa_cli.core.capacity import (
     Noise,
     duty_devices,
@@ -17,6 +20,7 @@ from hjepa_cli.core.capacity import (
     late_slots,
     slot_capacity,
 )
+from hjepa_cli.core.metrics import TAILS
 
 Law = Literal["duty", "equal"]
 Row = dict[str, Any]
@@ -131,14 +135,33 @@ def gain(rows: Sequence[Row], method: str, over: str, snr_db: float) -> Row | No
     at = {row["method"]: row for row in rows if row["snr_db"] == snr_db and row["devices"]}
     if method not in at or over not in at:
         return None
-    above, below = ((at[name]["devices"], *at[name]["devices_ci95"]) for name in (method, over))
-    return {
-        "snr_db": snr_db,
-        "method": method,
-        "over": over,
-        "ratio": above[0] / below[0],
-        "ratio_ci95": ratio_interval(above, below),
-    }
+    return {"snr_db": snr_db, "method": method, "over": over, **ratio_of(at[method], at[over])}
+
+
+def ratio_of(above: Row, below: Row) -> Row:
+    """Return ``ratio`` and ``ratio_ci95`` of the devices of two rows that have some.
+
+    Rows counted on the same seeds, two or more (``devices_by_seed``), are compared seed by seed.
+    """
+    ratio = above["devices"] / below["devices"]
+    pairs = list(zip(*(row.get("devices_by_seed", ()) for row in (above, below)), strict=False))
+    if len(pairs) > 1 and all(min(pair) > 0 for pair in pairs):
+        return {"ratio": ratio, "ratio_ci95": paired_interval(pairs)}
+    ends = [(row["devices"], *row["devices_ci95"]) for row in (above, below)]
+    return {"ratio": ratio, "ratio_ci95": ratio_interval(ends[0], ends[1])}
+
+
+def best_flat(rows: Sequence[Row], snr_db: float) -> Row | None:
+    """Return the row of the flat predictor (``ts-jepa-…``) with the most devices at one SNR."""
+    flat = [row for row in rows if row["snr_db"] == snr_db and row["method"].startswith("ts-jepa-")]
+    return max(flat, key=lambda row: row["devices"] or 0, default=None)
+
+
+def paired_interval(pairs: Sequence[tuple[float, float]]) -> list[float]:
+    """Return Student's 95 % interval of the ratio of pairs, taken on the logarithm."""
+    logs = np.log([above / below for above, below in pairs])
+    half = stats.t.ppf(TAILS[1], len(logs) - 1) * logs.std(ddof=1) / math.sqrt(len(logs))
+    return [math.exp(logs.mean() - half), math.exp(logs.mean() + half)]
 
 
 def ratio_interval(

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hjepa_cli.core.disagreement import Levels, calibrate_levels
 from hjepa_cli.core.growth import Growth, conformal_growth
 from hjepa_cli.core.loop import (
     STATE_LIMIT,
@@ -28,6 +29,7 @@ from hjepa_cli.errors import NumericalError
 from hjepa_cli.settings import ProtocolSettings
 
 CHUNK_STEPS = 256
+CALIBRATION_DEVICES = 39  # (39 + 1) · 0.9 is whole: the conformal quantile is exact
 
 
 class ForesightedController(Controller, Protocol):
@@ -85,6 +87,8 @@ def simulate_cell(
     packets, steps = np.zeros(devices, dtype=np.int64), protocol.steps
     for k in range(steps):
         uplink.begin()
+        if access.levels and k:
+            uplink.weigh(controller.apart)
         if uplink.listens:
             _report(uplink, world, controller, method, plant.force_limit_n)
         arrived = uplink.grant()
@@ -100,7 +104,7 @@ def measure_growth(
     seed: int,
     method: Method,
     *,
-    devices: int = 39,
+    devices: int = CALIBRATION_DEVICES,
     longest: int = 320,
 ) -> Growth:
     """Calibrate a method's growth table: one packet, then the loop runs on predicted forces alone.
@@ -110,6 +114,31 @@ def measure_growth(
         devices: calibration loops.
         longest: A_max in steps; fewer where the protocol is shorter.
     """
+    ages, errors, _ = _without_packets(plant, protocol, seed, method, devices, longest)
+    return conformal_growth(ages, errors)
+
+
+def measure_levels(
+    plant: System,
+    protocol: ProtocolSettings,
+    seed: int,
+    method: Method,
+    *,
+    devices: int = 2 * CALIBRATION_DEVICES,
+    longest: int = 320,
+) -> Levels:
+    """Calibrate the disagreement of a method's levels, as :func:`measure_growth` does the age.
+
+    Args:
+        method: its controller has two levels.
+    """
+    return calibrate_levels(*_without_packets(plant, protocol, seed, method, devices, longest))
+
+
+def _without_packets(
+    plant: System, protocol: ProtocolSettings, seed: int, method: Method, devices: int, longest: int
+) -> tuple[list[int], Floats, Floats]:
+    """Ages [G], and of each device then: the force's error and its levels' distance [n, G]."""
     longest = min(longest, protocol.steps - 1)
     wanted = sorted({1, 2, longest, *np.geomspace(4, longest, 20).astype(int).tolist()})
     ages = [age for age in wanted if age <= longest]
@@ -117,13 +146,14 @@ def measure_growth(
     controller: Any = method.controller(devices)
     everybody, nobody = np.ones(devices, dtype=bool), np.zeros(devices, dtype=bool)
     world.move(controller.act(everybody, world.sense(method.sensor, everybody)))
-    errors = []
+    errors, apart = [], []
     for age in range(1, longest + 1):
         if age in ages:
             planned = controller.outlook()
             errors.append(_innovation(world, method, everybody, planned, plant.force_limit_n))
+            apart.append(np.array(getattr(controller, "apart", np.zeros(devices))))
         world.move(controller.act(nobody, None))
-    return conformal_growth(ages, np.stack(errors, axis=1))
+    return ages, np.stack(errors, axis=1), np.stack(apart, axis=1)
 
 
 class World:

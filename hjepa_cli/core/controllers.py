@@ -80,6 +80,11 @@ class StrideController:
         return np.asarray(played, dtype=np.float64)
 
     @property
+    def reached(self) -> tuple[Bools, Tensor]:
+        """Whose stride is over [n], and the embeddings [n, D] that the strides lead to."""
+        return self._phase == self._planner.stride, self._anchors
+
+    @property
     def belief(self) -> tuple[Tensor, Tensor, Floats]:
         """Where the controller takes its devices to be, at the step it acted on last.
 

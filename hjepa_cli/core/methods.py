@@ -17,6 +17,7 @@ from torch import Tensor
 from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core.codecs import Codec, bits_of, build_codec
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
+from hjepa_cli.core.disagreement import TwoLevels
 from hjepa_cli.core.loop import Controller, Sensor
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.system import Floats, System
@@ -41,6 +42,7 @@ class Method:
         bits_per_transmission: what a transmission costs.
         family: methods of one family play the same when a packet arrives at every step.
         uses_link: ``False`` for ``optimal``, which sees every state whatever the link does.
+        two_levels: builds the controller with a second level beside it, where the method has two.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Method:
     bits_per_transmission: int
     family: str
     uses_link: bool = True
+    two_levels: Callable[[int], TwoLevels] | None = None
 
 
 def build_method(name: str, settings: Settings, model: "Model | None") -> Method:
@@ -104,7 +107,10 @@ def embedding_method(name: str, model: "Model", codec: Codec) -> Method:
         planner, shape = model.planner(name), model.action_shape
         build = functools.partial(StrideController, planner, action_shape=shape)
     sensor = embedding_sensor(model, codec)
-    return Method(name, sensor, build, reactive, codec.bits, "embedding")
+    two_levels = functools.partial(_two_levels, model) if name == "hjepa" else None
+    return Method(
+        name, sensor, build, reactive, codec.bits, "embedding", two_levels=two_levels
+    )
 
 
 def true_state(previous: Floats, states: Floats) -> Floats:
@@ -127,3 +133,9 @@ def embedding_sensor(model: "Model", codec: Codec) -> Callable[[Floats, Floats],
         return torch.cat(received).to(model.device)
 
     return sense
+
+
+def _two_levels(model: "Model", devices: int) -> TwoLevels:
+    planner, shape = model.planner("hjepa"), model.action_shape
+    hierarchical = StrideController(planner, devices, action_shape=shape)
+    return TwoLevels(hierarchical, model.single_step, model.actor, model.force_limit_n)

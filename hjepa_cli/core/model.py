@@ -208,6 +208,12 @@ class Model:
         with self.autocast():
             return self.force_limit_n * self._act(z)
 
+    def single_step(self, z: Tensor, forces_n: Tensor) -> Tensor:
+        """The level of stride 1, ``ts-jepa-1``: z [N, D], forces_n [N, *A] → embeddings [N, D]."""
+        with self.autocast():
+            actions = forces_n.to(self.device).unsqueeze(1) / self.force_limit_n
+            return self.networks["flat"](z, actions)  # type: ignore[no-any-return]
+
     def planner(self, method: str) -> Planner:
         """The planner behind ``method``.
 

@@ -27,13 +27,13 @@ class LoadPoint:
     """One simulated load.
 
     Attributes:
-        load: devices per block.
+        load: devices per block; whole where a search asks for it.
         blocks: J.
         outcome: of ``load · blocks`` devices.
         reference: the teacher's score of the same devices [N].
     """
 
-    load: int
+    load: float
     blocks: int
     outcome: CellOutcome
     reference: Floats
@@ -65,6 +65,7 @@ class SupportedLoad:
         at_least: still acceptable at the largest load tried.
         packets_per_slot, reports_per_slot: per block, at the nearest load inside.
         points: (load, score) as simulated, ascending.
+        parts: of each seed, where this is an average over seeds.
     """
 
     load: float
@@ -72,12 +73,13 @@ class SupportedLoad:
     at_least: bool
     packets_per_slot: float
     reports_per_slot: float
-    points: tuple[tuple[int, float], ...]
+    points: tuple[tuple[float, float], ...]
+    parts: tuple["SupportedLoad", ...] = ()
 
 
-def blocks_for(load: int) -> int:
+def blocks_for(load: float) -> int:
     """J, so that about :data:`BLOCK_DEVICES` devices are simulated."""
-    return max(1, BLOCK_DEVICES // load)
+    return max(1, int(BLOCK_DEVICES // load))
 
 
 def find_load(
@@ -87,6 +89,7 @@ def find_load(
     *,
     replicates: int,
     seed: int,
+    start: float | None = None,
 ) -> SupportedLoad:
     """Bisect the load on a logarithmic scale, at most 8 times.
 
@@ -96,11 +99,18 @@ def find_load(
         bracket: relative width at which to stop.
         replicates, seed: of the bootstrap over devices. It takes devices as independent; they share
             blocks, so that several seeds say more.
+        start: a load near the one to find, like that of another seed: fewer to simulate.
     """
     points: dict[int, LoadPoint] = {}
-    low, high = 1, MAX_LOAD
+    low, high, step = 1, MAX_LOAD, 1 + 4 * bracket
     for _ in range(MAX_BISECTIONS):
-        middle = round(math.sqrt(low * high)) if points else round(math.sqrt(high))
+        if not points:
+            middle = min(round(start or math.sqrt(high)), high)
+        elif start and not (low in points and high in points):
+            middle = round(high / step) if high in points else round(low * step)
+            middle, step = min(max(middle, 1), MAX_LOAD), step**2
+        else:
+            middle = round(math.sqrt(low * high))
         if middle in points:
             middle = min({low, high} - points.keys(), default=0)
         if not middle:
@@ -130,7 +140,19 @@ def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
         packets_per_slot=float(np.mean([one.packets_per_slot for one in found])),
         reports_per_slot=float(np.mean([one.reports_per_slot for one in found])),
         points=tuple(point for one in found for point in one.points),
+        parts=tuple(found),
     )
+
+
+def pooled_score(
+    points: Sequence[LoadPoint], replicates: int, seed: int
+) -> tuple[float, tuple[float, float]]:
+    """Normalised score of one load over the devices of all seeds, with its 95 % interval."""
+    score = np.concatenate([point.outcome.score for point in points])
+    reference = np.concatenate([point.reference for point in points])
+    weights = metrics.bootstrap_weights(len(score), replicates, seed)
+    low, high = metrics.interval(metrics.ratio(score, reference, weights))
+    return float(metrics.ratio(score, reference)), (float(low), float(high))
 
 
 def _crossing(

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hjepa_cli.core.disagreement import Levels
 from hjepa_cli.core.fading import block_fading
 from hjepa_cli.core.growth import Growth
 from hjepa_cli.core.schedulers import REPORTING, SCHEDULERS, pick
@@ -22,8 +23,8 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LEVEL_BITS = 8  # of a reported innovation
-CHECK_PERIOD = 4  # slots between a device's looks at its own camera, staggered over devices
-REPORT_AGAIN = 2.0  # times the last report: an innovation is reported once, and when it doubles
+CHECK_PERIOD = 8  # slots between a device's looks at its own camera, staggered over devices
+REPORT_AGAIN = 1.2  # times the last report: an innovation is reported, and again when it grows
 REPORTS_PER_BLOCK = 1.0  # that δ is steered to: a candidate for every transmission
 STEERING = 0.02  # of ln δ per slot and excess report
 _ERRORS_KEY = 0xE5
@@ -43,6 +44,7 @@ class Access:
         block_error: share of transmissions that fail although the power sufficed.
         growth: of the control error with age, measured for the controller.
         seed: of the fading.
+        levels: scales the growth by the disagreement of a controller's levels.
     """
 
     scheduler: str
@@ -53,6 +55,7 @@ class Access:
     block_error: float
     growth: Growth
     seed: int
+    levels: Levels | None = None
 
 
 def report_bits(devices: int) -> int:
@@ -100,7 +103,7 @@ class Uplink:
         self._waited = np.arange(devices, 0, -1)
         self._queue = np.zeros(devices)
         self._reported = np.zeros(devices)
-        self._reported_age = np.zeros(devices, dtype=np.int64)
+        self._doubt = np.ones(devices)
         self.reports = 0
 
     @property
@@ -112,10 +115,21 @@ class Uplink:
         """Start a slot: new fading."""
         self._gain = next(self._fading)
 
+    def weigh(self, apart: Floats) -> None:
+        """Take how far each controller's levels are apart [N]."""
+        if self._access.levels:
+            self._doubt = self._access.levels.doubt(self._age, apart)
+
     def checking(self) -> Bools:
-        """Which devices compare the controller's force with their own in this slot [N]."""
+        """Which devices compare the controller's force with their own in this slot [N].
+
+        Those whose turn it is, who could report, and whose error may well be beyond δ.
+        """
         turn = (self._slot + np.arange(len(self._gain))) % CHECK_PERIOD == 0
-        return np.asarray(turn & self._able if self._slot else np.zeros_like(turn))
+        if not self._slot:
+            return np.zeros_like(turn)
+        due = self._access.growth.at(self._age) * self._doubt >= self._delta**2
+        return np.asarray(turn & self._able & due)
 
     def hear(self, devices: Bools, innovation: Floats) -> None:
         """Take the innovations |C(z) − ũ| ÷ 40 N of ``devices``, of which some report."""
@@ -125,7 +139,6 @@ class Uplink:
         tells = (innovation >= self._delta) & ((level + 0.5) / levels >= REPORT_AGAIN * known)
         who = np.flatnonzero(devices)[tells]
         self._reported[who] = (level[tells] + 0.5) / levels
-        self._reported_age[who] = self._age[who]
         self.reports += len(who)
         # The other devices look in other slots: this slot's reports are its share of all.
         excess = len(who) / self._access.blocks - REPORTS_PER_BLOCK
@@ -143,8 +156,8 @@ class Uplink:
             power=self._power,
             queue=self._queue,
             reported=self._reported,
-            reported_age=self._reported_age,
             growth=self._access.growth,
+            doubt=self._doubt,
         )
         chosen = pick(self._score(view), self._access.blocks)
         decoded = self._errors.random(len(chosen)) >= self._access.block_error
@@ -153,7 +166,6 @@ class Uplink:
         self._queue = np.maximum(self._queue - self._fair_age, 0.0) + self._age
         self._age = np.where(arrived, 0, self._age) + 1
         self._reported[arrived] = 0.0
-        self._reported_age[arrived] = 0
         self._slot += 1
         return arrived
 

@@ -246,7 +246,8 @@ def scale_section(result: Mapping[str, Any]) -> list[str]:
     """Device counts with their intervals, and the gains."""
     by_method: dict[str, list[Mapping[str, Any]]] = {}
     for row in result["rows"]:
-        by_method.setdefault(row["method"], []).append(row)
+        names = (row["method"], row.get("scheduler"))
+        by_method.setdefault(", ".join(filter(None, names)), []).append(row)
     grid_db = sorted({row["snr_db"] for row in result["rows"]})
     ranked = sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
     rows = [
@@ -329,9 +330,8 @@ def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Pat
     """Devices against the SNR."""
     from hjepa_cli import figures
 
-    label = "Target SNR (dB)" if result["law"] == "duty" else "Mean SNR (dB)"
-    caption = f"Supported devices, law {result['law']}, 95 % bands"
-    return {"devices": (caption, figures.devices_figure(result["rows"], snr_label=label))}
+    caption = f"Supported devices, law {result['law']}, 95 % intervals"
+    return {"devices": (caption, figures.scale_figure(result))}
 
 
 SECTIONS: dict[str, tuple[Callable[..., list[str]], Callable[..., Figures]]] = {

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.core.capacity import parse_snr
-from hjepa_cli.core.cell import Cell, Need, Row, gain
+from hjepa_cli.core.cell import Cell, Need, Row, best_flat, gain
 from hjepa_cli.core.plant import plant
-from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
+from hjepa_cli.errors import MissingInputError, NumericalError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.evaluate import Subject, curves_for, measure_points, open_subject
@@ -22,7 +22,6 @@ from hjepa_cli.storage.runs import Run
 
 PAPER_GAIN_PERCENT = 42.83  # abstract: "up to 42.83 % more devices", at 20 dB
 PAPER_SNR_DB = 20.0
-RIVALS = ("ts-jepa-1", "hold")  # hjepa's
 VERIFY_AT = (0.9, 1.1)  # times the tolerance
 
 CSV_COLUMNS = (
@@ -94,7 +93,7 @@ def run(
             "slot_s": cell.slot_s,
             "limit_bits_per_s": cell.limit_bits_per_s,
             "rows": rows,
-            "gains": [found for rival in RIVALS if (found := gain(rows, "hjepa", rival, at_db))],
+            "gains": gains(rows, at_db),
             "paper_gain_percent": PAPER_GAIN_PERCENT,
             "skipped": skipped,
         }
@@ -116,9 +115,7 @@ def run_scheduled(
     """Hand over to the law that is simulated, not computed from curves."""
     from hjepa_cli.stages import scheduled
 
-    if verify:
-        raise UsageError("--verify is for the laws duty and equal; scheduled simulates every count")
-    return scheduled.run(settings, screen, checkpoint=checkpoint, out=out)
+    return scheduled.run(settings, screen, checkpoint=checkpoint, out=out, verify=verify)
 
 
 def cell_of(settings: Settings) -> Cell:
@@ -126,6 +123,13 @@ def cell_of(settings: Settings) -> Cell:
     radio, chosen = settings.radio, plant(settings.plant)
     limit_bits_per_s = chosen.data_rate_limit_bits_per_s
     return Cell(radio.law, radio.noise, radio.bandwidth_hz, chosen.step_s, limit_bits_per_s)
+
+
+def gains(rows: Sequence[Row], snr_db: float) -> list[Row]:
+    """``hjepa`` over one-step TS-JEPA, the best flat predictor, hold and the oracle."""
+    flat = best_flat(rows, snr_db)
+    rivals = dict.fromkeys(["ts-jepa-1", *([flat["method"]] if flat else []), "hold", "oracle"])
+    return [found for rival in rivals if (found := gain(rows, "hjepa", rival, snr_db))]
 
 
 def verify_need(need: Need, subject: Subject, screen: Screen) -> list[Row]:
@@ -200,11 +204,8 @@ def draw(result: Mapping[str, Any], directory: Path, screen: Screen) -> list[Pat
             raise
         screen.say('no figure without matplotlib: pip install "hjepa[plot]"')
         return []
-    figure = figures.devices_figure(
-        result["rows"],
-        title=f"{_described(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI",
-        snr_label="Target SNR (dB)" if result["law"] == "duty" else "Mean SNR (dB)",
-    )
+    title = f"{_described(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI"
+    figure = figures.scale_figure(result, title=title)
     return [figures.save(figure, directory / f"devices.{kind}") for kind in ("png", "svg")]
 
 

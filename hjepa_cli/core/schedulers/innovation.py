@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from hjepa_cli.core.schedulers.view import View
 
-FAIRNESS = 1e-9  # devices without a report by age, after all that have one
+UNTOLD = 1e-6  # of what devices without a report may err by: they come after all that have one
 
 
 def score(view: View) -> NDArray[np.float64]:
-    """The reported e², grown from when it was reported to now, plus a little for age."""
-    grown = view.growth.at(view.age) / view.growth.at(np.maximum(view.reported_age, 1))
-    value = view.reported**2 * grown + FAIRNESS * view.age
-    return np.where(view.able, value, 0.0)
+    """The reported e², and a little for what the others may have come to by now."""
+    untold = UNTOLD * view.growth.at(view.age) * view.doubt
+    return np.where(view.able, view.reported**2 + untold, 0.0)

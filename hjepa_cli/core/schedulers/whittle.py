@@ -7,5 +7,8 @@ from hjepa_cli.core.schedulers.view import View
 
 
 def score(view: View) -> NDArray[np.float64]:
-    """A f(A + 1) − Σ_{j ≤ A} f(j) for devices that can send now (they then succeed for certain)."""
-    return np.where(view.able, view.growth.index(view.age), 0.0)
+    """A f(A + 1) − Σ_{j ≤ A} f(j) for devices that can send now (they then succeed for certain).
+
+    Where a device's own uncertainty is known, its f is that much larger at every age.
+    """
+    return np.where(view.able, view.growth.index(view.age) * view.doubt, 0.0)
