@@ -34,6 +34,22 @@ def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return root
 
 
+def test_the_model_with_the_wanted_strides_is_found_before_the_first(models: Path) -> None:
+    for name, strides in (("desktop-h16m4l1", (16, 4, 1)), ("desktop-h4m2l1", (4, 2, 1))):
+        architecture = dict(zip("hml", strides, strict=True))
+        (models / name).mkdir(exist_ok=True)
+        save_checkpoint(
+            models / name / MODEL_FILE,
+            {"w": np.zeros(3, np.float32)},
+            {"plant": "desktop", "architecture": architecture},
+        )
+    found = [zoo.find_model("desktop", strides) for strides in ((4, 2, 1), (16, 4, 1), (8, 2, 1))]
+    assert [path.parent.name for path in found if path] == [
+        "desktop-h4m2l1", "desktop-h16m4l1", "desktop-h16m4l1",
+    ]  # fmt: skip
+    assert zoo.find_model("unknown", (4, 2, 1)) is None
+
+
 def digest_of(model: Path) -> str:
     return zoo.load_checkpoint(model / MODEL_FILE).digest
 

@@ -108,9 +108,7 @@ def embedding_method(name: str, model: "Model", codec: Codec) -> Method:
         build = functools.partial(StrideController, planner, action_shape=shape)
     sensor = embedding_sensor(model, codec)
     two_levels = functools.partial(_two_levels, model) if name == "hjepa" else None
-    return Method(
-        name, sensor, build, reactive, codec.bits, "embedding", two_levels=two_levels
-    )
+    return Method(name, sensor, build, reactive, codec.bits, "embedding", two_levels=two_levels)
 
 
 def true_state(previous: Floats, states: Floats) -> Floats:

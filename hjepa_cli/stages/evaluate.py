@@ -349,7 +349,7 @@ def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:
 
 
 def _default_model(settings: Settings, screen: Screen) -> Path | None:
-    """The newest finished run of the plant, else the zoo's first model of it."""
+    """The newest finished run of the plant, else the zoo's with the settings' strides."""
 
     def fits(directory: Path) -> bool:
         return bool(runs.read_config(directory).get("plant") == settings.plant)
@@ -358,7 +358,8 @@ def _default_model(settings: Settings, screen: Screen) -> Path | None:
     if directory:
         screen.say(f"model of the newest run, {directory}")
         return directory / MODEL_FILE
-    path = zoo.find_model(settings.plant)
+    hierarchy = settings.hierarchy
+    path = zoo.find_model(settings.plant, (hierarchy.h, hierarchy.m, hierarchy.l))
     if path:
         screen.say(f"no run of train-hierarchy here: model {path.parent.name} of the zoo")
         return path

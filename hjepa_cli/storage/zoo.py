@@ -8,6 +8,7 @@ editable install have it beside the package.
 import dataclasses
 import difflib
 import re
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -47,12 +48,20 @@ def list_models() -> list[str]:
     return [name for name in names if (root / name / MODEL_FILE).is_file()]
 
 
-def find_model(plant_name: str) -> Path | None:
-    """Return the checkpoint file of the zoo's first model of a plant, if there is one."""
+def find_model(plant_name: str, strides: Sequence[int] = ()) -> Path | None:
+    """Return the checkpoint file of the zoo's model of a plant, if there is one.
+
+    The first one with ``strides`` (h, m, l); where no model has them, the first one.
+    """
+    first = None
     for path in map(resolve_model, list_models()):
-        if load_checkpoint(path).metadata.get("plant") == plant_name:
-            return path
-    return None
+        metadata = load_checkpoint(path).metadata
+        if metadata.get("plant") == plant_name:
+            architecture = metadata.get("architecture", {})
+            if [architecture.get(name) for name in ("h", "m", "l")] == list(strides):
+                return path
+            first = first or path
+    return first
 
 
 def resolve_model(name_or_path: str | Path) -> Path:
