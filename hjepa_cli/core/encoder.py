@@ -1,6 +1,6 @@
 """The context encoder Ψ: two camera frames in, one embedding out (paper §III-A).
 
-A residual network with three stages of 64, 128 and 256 channels keeps a 4 × 8 map to its last
+A residual network with three stages of 64, 128 and 256 channels keeps a 2 × 4 map to its last
 layer, because a cart-pole is where things are: global average pooling would throw the positions
 away. Frames travel as uint8 [N, 2, H, W, 3] (previous, current), which is already channels-last
 memory, the layout the convolutions are fastest in.
@@ -28,7 +28,7 @@ from hjepa_cli.core.symmetry import (
 
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 STEM_PX, STEM_CHANNELS = 4, 64
-MAP_CHANNELS = 32
+MAP_PX, MAP_CHANNELS = 32, 128  # a value of the last map stands for that many pixels, squared
 
 
 def normalise(z: Tensor) -> Tensor:
@@ -106,9 +106,9 @@ class Encoder(nn.Module):
         self.stages = nn.Sequential(
             ResidualBlock(STEM_CHANNELS, 64, 2, symmetric=symmetric),
             ResidualBlock(64, 128, 2, symmetric=symmetric),
-            ResidualBlock(128, 256, 1, symmetric=symmetric),
+            ResidualBlock(128, 256, 2, symmetric=symmetric),
         )
-        features = MAP_CHANNELS * (HEIGHT_PX // (STEM_PX * 4)) * (WIDTH_PX // (STEM_PX * 4))
+        features = MAP_CHANNELS * (HEIGHT_PX // MAP_PX) * (WIDTH_PX // MAP_PX)
         self.squeeze = _conv(256, MAP_CHANNELS, 1, 1, 0, symmetric, bias=True)
         self.head: nn.Module = nn.Linear(features, embedding)
         self.centre: nn.Module | None = nn.BatchNorm1d(embedding, affine=False)
