@@ -166,6 +166,7 @@ def assert_close_runs(several: Path, one: Path) -> None:
     np.testing.assert_allclose(losses(several), losses(one), rtol=TOLERANCE, atol=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_torchrun_trains_what_one_process_trains(place: Path) -> None:
     """The command of the documentation, word for word but for --config."""
     command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
@@ -204,6 +205,7 @@ def kill_second(rank: int) -> None:
     Optimiser.step = step  # type: ignore[method-assign]
 
 
+@pytest.mark.slow
 def test_a_killed_process_ends_the_others_and_the_run_goes_on(place: Path) -> None:
     assert train(place, "adam", "whole") == [0, 0]
     assert train(place, "adam", "killed", prepare=kill_second) == [70, -signal.SIGKILL]
