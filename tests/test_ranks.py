@@ -343,6 +343,12 @@ def test_commands_that_are_not_shared_are_refused(
         monkeypatch.setenv(name, value)
     refused = shell("train-encoder", "--quiet")
     assert_one_line_error(refused, 2, "11 processes cannot share a batch of 10 windows")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    for name, value in environment(0, 2, 1).items():
+        monkeypatch.setenv(name, value)
+    refused = shell("train-encoder", "--quiet")
+    assert_one_line_error(refused, 2, "2 processes on a machine with 1 GPUs", "--nproc-per-node 1")
     monkeypatch.setenv("RANK", "1")
     silent = shell("train-encoder", "--quiet")
     assert (silent.code, silent.out, silent.err) == (2, "", "")
