@@ -4,7 +4,7 @@ from typing import Any
 
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import dotted, load_settings
+from hjepa_cli.settings import PRESETS, dotted, load_settings
 from hjepa_cli.storage.zoo import CURVES_FILE, ZooModel, list_models, verify_model
 
 Result = dict[str, Any]
@@ -88,7 +88,8 @@ def missing_curves(model: ZooModel) -> list[str]:
     from hjepa_cli.stages.evaluate import Subject
     from hjepa_cli.storage import curves
 
-    settings = load_settings("gym" if model.metadata.get("plant") == "gym" else None)
+    plant = model.metadata.get("plant")
+    settings = load_settings(plant if plant in PRESETS else None)
     subject = Subject(settings, Model.load(model.path), model.path, None)
     found = curves.read(model.path.with_name(CURVES_FILE), subject.digest)
     return [name for name in subject.measurable(settings.methods) if name not in found]

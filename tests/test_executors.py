@@ -126,6 +126,7 @@ def places(cluster: Cluster) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_a_dataset_is_the_same_from_any_number_of_workers_and_from_a_cluster(
     cluster: Cluster,
 ) -> None:
@@ -143,6 +144,7 @@ def test_a_dataset_is_the_same_from_any_number_of_workers_and_from_a_cluster(
         assert contents(Path(name)) == contents(Path("zero"))
 
 
+@pytest.mark.slow
 def test_a_sweep_is_the_same_from_any_number_of_workers_and_from_a_cluster(
     cluster: Cluster,
 ) -> None:

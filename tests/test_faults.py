@@ -37,13 +37,20 @@
 | another memory layout, other last bits | test_resume.py::test_the_optimiser_keeps_its_memory_layout |
 | Ctrl-C leaves workers behind | test_evaluate.py::test_an_interrupt_ends_the_workers_at_once |
 | killed parent leaves workers behind | test_evaluate.py::test_workers_end_with_a_killed_parent |
+| threads change between a run's parts | test_resume.py::test_a_run_keeps_its_number_of_threads |
+| batch of a divergence unknown | test_resume.py::test_the_levels_name_their_batches_too |
+| process of a training killed | test_ranks.py::test_a_killed_process_ends_the_others_and_the_run_goes_on |
+| processes see different files | test_ranks.py::test_processes_must_see_the_same |
+| processes stop at different steps | test_ranks.py::test_all_stop_after_the_same_step_and_one_process_can_go_on |
+| cluster worker killed | test_executors.py::test_a_sweep_is_the_same_from_any_number_of_workers_and_from_a_cluster |
 | worker dies | test_executors.py::test_a_dead_worker_is_one_line |
 | Ctrl-C and SIGTERM in training | test_resume.py::test_a_real_process_saves_and_says_how_to_go_on |
 | markup in names is interpreted | test_security.py::test_a_model_of_any_name_prints_as_text |
 | two processes in one directory | test_runs.py::test_a_second_process_is_locked_out |
 | files of older and newer versions | test_schemas.py::test_newer_files_are_refused_with_what_to_do |
 | a dependency too many | test_security.py::test_dependencies_are_few_and_bounded |
-| released model is not what was measured | test_zoo.py::test_shipped_models_are_whole |
+| released model is not what was measured | test_zoo_numbers.py::test_a_few_devices_score_as_on_the_card |
+| released curves older than the protocol | test_zoo.py::test_verify_says_which_curves_are_not_those_of_the_defaults |
 """
 
 import ast

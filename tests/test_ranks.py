@@ -166,6 +166,7 @@ def assert_close_runs(several: Path, one: Path) -> None:
     np.testing.assert_allclose(losses(several), losses(one), rtol=TOLERANCE, atol=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_torchrun_trains_what_one_process_trains(place: Path) -> None:
     """The command of the documentation, word for word but for --config."""
     command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
@@ -204,6 +205,7 @@ def kill_second(rank: int) -> None:
     Optimiser.step = step  # type: ignore[method-assign]
 
 
+@pytest.mark.slow
 def test_a_killed_process_ends_the_others_and_the_run_goes_on(place: Path) -> None:
     assert train(place, "adam", "whole") == [0, 0]
     assert train(place, "adam", "killed", prepare=kill_second) == [70, -signal.SIGKILL]
@@ -341,6 +343,12 @@ def test_commands_that_are_not_shared_are_refused(
         monkeypatch.setenv(name, value)
     refused = shell("train-encoder", "--quiet")
     assert_one_line_error(refused, 2, "11 processes cannot share a batch of 10 windows")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    for name, value in environment(0, 2, 1).items():
+        monkeypatch.setenv(name, value)
+    refused = shell("train-encoder", "--quiet")
+    assert_one_line_error(refused, 2, "2 processes on a machine with 1 GPUs", "--nproc-per-node 1")
     monkeypatch.setenv("RANK", "1")
     silent = shell("train-encoder", "--quiet")
     assert (silent.code, silent.out, silent.err) == (2, "", "")

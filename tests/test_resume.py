@@ -280,6 +280,21 @@ def test_saved_state_that_does_not_fit_is_refused(
     assert_equal_runs(out, workplace / "train-encoder")
 
 
+def test_a_run_keeps_its_number_of_threads(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sums over two threads end in other last bits."""
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        signal_after(patched, 2)
+        with pytest.raises(Interrupted):
+            trainer("train-encoder", workplace)(tmp_path / "run")
+    torch.set_num_threads(2)
+    trainer("train-encoder", workplace)(tmp_path / "run")
+    assert torch.get_num_threads() == 1
+    assert_equal_runs(tmp_path / "run", workplace / "train-encoder")
+
+
 def test_resume_needs_no_other_flag(
     workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

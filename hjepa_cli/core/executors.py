@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeVar
@@ -198,7 +198,7 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
                 "address": dask.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
-                    dashboard_address=None,
+                    dashboard_address="127.0.0.1:0",  # None is port 8787, one per machine
                     silence_logs=logging.CRITICAL,
                 )
             }
@@ -217,7 +217,8 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
         finally:
             client.close()
             if where == LOCAL:
-                target["address"].close()
+                with suppress(TimeoutError):  # the work is done; they end with us
+                    target["address"].close()
 
 
 @contextmanager

@@ -116,13 +116,13 @@ def joined(device: torch.device, items: int) -> Iterator[Ranks]:
             hint=f"torchrun with at most {items} processes, or a larger encoder.batch_trajectories",
         )
     if device.type == "cuda":
-        local, there = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
-        if local >= there:
+        here, there = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
+        if here > there:
             raise UsageError(
-                f"{os.environ['LOCAL_WORLD_SIZE']} processes on a machine with {there} GPUs",
+                f"{here} processes on a machine with {there} GPUs",
                 hint=f"torchrun --nproc-per-node {there}, or --device cpu",
             )
-        torch.cuda.set_device(local)
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     # Counts and codes are exchanged on the CPU, whatever the device.
     backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
     dist.init_process_group(backend, timeout=TIMEOUT)

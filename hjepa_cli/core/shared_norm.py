@@ -21,8 +21,8 @@ class SharedBatchNorm(_BatchNorm):
         values = x.float()
         axes = [axis for axis in range(x.dim()) if axis != 1]
         shape = [1, -1, *[1] * (x.dim() - 2)]
-        mean, variance, count = _moments(values, axes)
-        self._remember(mean, variance * count / (count - 1))
+        mean, variance, unbiased = _moments(values, axes)
+        self._remember(mean, unbiased)
         y = (values - mean.view(shape)) * (variance + self.eps).rsqrt().view(shape)
         if self.affine:
             y = y * self.weight.view(shape) + self.bias.view(shape)
@@ -45,8 +45,8 @@ class SharedTwinNorm(TwinsAsOne, SharedBatchNorm):
     """The same for twins, see :class:`~hjepa_cli.core.symmetry.MirrorNorm2d`."""
 
 
-def _moments(values: Tensor, axes: list[int]) -> tuple[Tensor, Tensor, float]:
-    """Mean and variance [C] over all processes, in one message, and how many values they are of.
+def _moments(values: Tensor, axes: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, variance and unbiased variance [C] over all processes, in one message.
 
     In float64, because the second moment is large beside what is left of it.
     """
@@ -55,9 +55,9 @@ def _moments(values: Tensor, axes: list[int]) -> tuple[Tensor, Tensor, float]:
     count = values.numel() // values.shape[1]
     here = torch.cat([mean, variance + mean.square(), mean.new_ones(1)])
     first, second, total = torch.split(summed(count * here), [len(mean), len(mean), 1])
-    everywhere = total.item()
-    mean = first / everywhere
-    return mean.float(), (second / everywhere - mean.square()).float(), everywhere
+    mean = first / total
+    variance = second / total - mean.square()
+    return mean.float(), variance.float(), (variance * total / (total - 1)).float()
 
 
 def share_statistics(module: nn.Module) -> None:
