@@ -67,6 +67,7 @@ STYLES = {
     "zero-true": Style("#7F7F7F", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
 }
 OTHERS = [Style("#56B4E9", marker, "--") for marker in "PX<>phd*"]
+LONGEST_OF_THREE = 15  # characters of a label, for three columns of a legend
 
 SCHEDULER_STYLES = {
     "round-robin": Style("#7F7F7F", "s", ":", hollow=True),
@@ -114,7 +115,7 @@ def devices_figure(
         if len(grid_db) <= MARKERS:
             axes.set_xticks(grid_db)
         axes.grid(visible=True)
-        figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=2.4)
+        _legend(figure, axes)
         return figure
 
 
@@ -288,6 +289,7 @@ def score_figure(
             scores = np.array([point["score"] for point in curve], float)
             _line(axes, method, list(entries), np.array(where), scores, band)
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
         if kind == "gap":
@@ -402,4 +404,11 @@ def _line(
 def _finish(figure: Figure, axes: Axes, title: str) -> None:
     axes.set_title(title)
     axes.grid(visible=True)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=2.4)
+    _legend(figure, axes)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """Below the axes, in as many columns as the column of a paper has room for."""
+    longest = max((len(label) for label in axes.get_legend_handles_labels()[1]), default=0)
+    ncols = 3 if longest <= LONGEST_OF_THREE else 2
+    figure.legend(loc="outside lower center", ncols=ncols, frameon=False, handlelength=2.4)

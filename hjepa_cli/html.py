@@ -1,11 +1,13 @@
 """Self-contained HTML: every text is escaped, every picture is inside the file, no script."""
 
 import base64
+import itertools
 from collections.abc import Mapping, Sequence
 from html import escape
 from string import Template
 from typing import Any
 
+TEXT = ' class="text"'
 PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -18,10 +20,11 @@ PAGE = Template("""<!DOCTYPE html>
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
        max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 h1, h2, h3 { line-height: 1.2; } h2 { border-top: 1px solid #ccc; padding-top: 1rem; }
-table { border-collapse: collapse; margin: 1rem 0; font-size: 0.9rem; }
-th, td { padding: 0.2rem 0.8rem; border-bottom: 1px solid #ddd; text-align: right; }
-th:first-child, td:first-child { text-align: left; }
-td.text { text-align: left; }
+.table { overflow-x: auto; margin: 1rem 0; }
+table { border-collapse: collapse; font-size: 0.85rem; }
+th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: right;
+         white-space: nowrap; }
+th.text, td.text, th:first-child, td:first-child { text-align: left; white-space: normal; }
 pre, code { background: #f5f5f5; font-size: 0.85rem; } pre { padding: 0.6rem; overflow-x: auto; }
 figure { margin: 1rem 0; display: inline-block; vertical-align: top; max-width: 27rem; }
 figure img { width: 100%; } figcaption { color: #555; font-size: 0.9rem; }
@@ -63,10 +66,15 @@ def details(summary: str, content: str) -> str:
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A table of texts and numbers; ``None`` is an empty cell."""
-    head = "".join(f"<th>{escape(column)}</th>" for column in columns)
     lines = ["".join(map(_cell, row)) for row in rows]
+    words = [all(map(_is_text, cells)) for cells in zip(*rows, strict=True)]
+    head = "".join(
+        f"<th{TEXT if is_text else ''}>{escape(column)}</th>"
+        for column, is_text in itertools.zip_longest(columns, words)
+    )
     body = "\n".join(f"<tr>{line}</tr>" for line in lines)
-    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table>"
+    inside = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>"
+    return f'<div class="table"><table>{inside}</table></div>'
 
 
 def pairs(values: Mapping[str, Any]) -> str:
@@ -86,9 +94,9 @@ def picture(data: bytes, kind: str, caption: str) -> str:
 
 def _cell(value: object) -> str:
     text = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-    kind = ' class="text"' if isinstance(value, str) and not _numeric(text) else ""
-    return f"<td{kind}>{escape(text)}</td>"
+    return f"<td{TEXT if _is_text(value) else ''}>{escape(text)}</td>"
 
 
-def _numeric(text: str) -> bool:
-    return text[:1].isdigit() or text[:1] in "-+<>≥≤"
+def _is_text(value: object) -> bool:
+    """Not a number, nor a text that begins with one."""
+    return isinstance(value, str) and not (value[:1].isdigit() or value[:1] in "-+<>≥≤")
