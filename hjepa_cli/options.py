@@ -394,6 +394,17 @@ Schedulers = Annotated[
         "A,B",
     ),
 ]
+Uncertainty = Annotated[
+    str | None,
+    _one_of(
+        RADIO,
+        "--uncertainty",
+        "Law scheduled: of a prediction by its age, or also by how far a hierarchy's levels "
+        "disagree; for the schedulers whittle and innovation.",
+        "age",
+        "levels",
+    ),
+]
 Topology = Annotated[
     str | None,
     _one_of(

@@ -276,8 +276,8 @@ def _plan_scheduled(
             f"{settings.protocol.steps} slots in each of {searches} searches for "
             f"{len(methods)} methods under {', '.join(radio.schedulers)}"
         ],
-        writes=[f"run {_run('scale', out)} with the table (CSV)"],
-        writes_bytes=100_000,
+        writes=[f"run {_run('scale', out)} with the table (CSV) and the figure"],
+        writes_bytes=300_000,
         seconds=5 + _drive_seconds(settings, methods, searches * SEARCH_LOADS * BLOCK_DEVICES),
     )
 

@@ -182,7 +182,7 @@ def controllers() -> dict[str, Controller]:
     return built | {"stride": StrideController(Linear(4), 2)}
 
 
-def embedding_controllers() -> dict[str, Controller]:
+def untrained_model() -> Model:
     settings = load_settings(flags={"encoder.hidden": 8})
     architecture = describe_architecture(settings) | {
         "kind": "hierarchy",
@@ -194,7 +194,11 @@ def embedding_controllers() -> dict[str, Controller]:
         "plant": "desktop",
         "settings": settings.as_dict(),
     }
-    model = Model(build_modules(architecture), metadata, "", "cpu")
+    return Model(build_modules(architecture), metadata, "", "cpu")
+
+
+def embedding_controllers() -> dict[str, Controller]:
+    model = untrained_model()
     return {
         name: embedding_method(name, model, Integers(256, 8)).controller(2)
         for name in model.methods

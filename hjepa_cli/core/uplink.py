@@ -24,7 +24,7 @@ Bools = NDArray[np.bool_]
 
 LEVEL_BITS = 8  # of a reported innovation
 CHECK_PERIOD = 8  # slots between a device's looks at its own camera, staggered over devices
-REPORT_AGAIN = 1.2  # times the last report: an innovation is reported, and again when it grows
+REPORT_AGAIN = 2.0  # times the last report: an innovation is reported once, and when it doubles
 REPORTS_PER_BLOCK = 1.0  # that δ is steered to: a candidate for every transmission
 STEERING = 0.02  # of ln δ per slot and excess report
 _ERRORS_KEY = 0xE5
@@ -103,6 +103,7 @@ class Uplink:
         self._waited = np.arange(devices, 0, -1)
         self._queue = np.zeros(devices)
         self._reported = np.zeros(devices)
+        self._reported_age = np.zeros(devices, dtype=np.int64)
         self._doubt = np.ones(devices)
         self.reports = 0
 
@@ -139,6 +140,7 @@ class Uplink:
         tells = (innovation >= self._delta) & ((level + 0.5) / levels >= REPORT_AGAIN * known)
         who = np.flatnonzero(devices)[tells]
         self._reported[who] = (level[tells] + 0.5) / levels
+        self._reported_age[who] = self._age[who]
         self.reports += len(who)
         # The other devices look in other slots: this slot's reports are its share of all.
         excess = len(who) / self._access.blocks - REPORTS_PER_BLOCK
@@ -156,6 +158,7 @@ class Uplink:
             power=self._power,
             queue=self._queue,
             reported=self._reported,
+            reported_age=self._reported_age,
             growth=self._access.growth,
             doubt=self._doubt,
         )
@@ -166,6 +169,7 @@ class Uplink:
         self._queue = np.maximum(self._queue - self._fair_age, 0.0) + self._age
         self._age = np.where(arrived, 0, self._age) + 1
         self._reported[arrived] = 0.0
+        self._reported_age[arrived] = 0
         self._slot += 1
         return arrived
 

@@ -76,6 +76,7 @@ def run(
             "n_devices": BLOCK_DEVICES,
             "acceptable_score": level,
             "law": radio.law,
+            "uncertainty": radio.uncertainty,
             "topology": radio.topology,
             "power_margin_db": radio.power_margin_db if radio.topology == "target" else None,
             "coherence_slots": radio.coherence_slots,

@@ -15,6 +15,8 @@ UNTOLD = 1e-6  # of what devices without a report may err by: they come after al
 
 
 def score(view: View) -> NDArray[np.float64]:
-    """The reported e², and a little for what the others may have come to by now."""
-    untold = UNTOLD * view.growth.at(view.age) * view.doubt
-    return np.where(view.able, view.reported**2 + untold, 0.0)
+    """The reported e², grown since; a little for what devices without a report have come to."""
+    now = view.growth.at(view.age)
+    grown = now / view.growth.at(np.maximum(view.reported_age, 1))
+    value = view.reported**2 * grown + UNTOLD * now * view.doubt
+    return np.where(view.able, value, 0.0)
