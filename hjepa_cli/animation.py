@@ -233,7 +233,7 @@ def _rgb(colour: Sequence[int]) -> str:
 
 
 def _write_gif(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
-    palette = pictures.draw(pictures.steps[-1]).quantize(COLOURS)  # one for all: no flicker
+    palette = _palette(pictures.draw(pictures.steps[-1]))  # one for all: no flicker
     shots = []
     for picture in pictures:
         shots.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
@@ -241,6 +241,15 @@ def _write_gif(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None
     shots[0].save(
         path, "GIF", save_all=True, append_images=shots[1:], duration=round(1000 / fps), loop=0
     )
+
+
+def _palette(picture: Image.Image) -> Image.Image:
+    """The commonest colours of a picture, and for certain those of the strips, however rare."""
+    kept = (*ARRIVED, *LOST)
+    common = picture.quantize(COLOURS - len(kept) // 3).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*common[: 3 * COLOURS - len(kept)], *kept])
+    return palette
 
 
 def _write_mp4(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:

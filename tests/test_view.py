@@ -211,6 +211,17 @@ def test_view_writes_the_same_gif_twice(shell, checkpoint):
     assert left == {"small.toml", "hjepa-view.gif", "again.gif"}
 
 
+def test_a_gif_keeps_the_colours_of_the_strip(tmp_path):
+    """Few pixels have them: a palette of the commonest colours would not."""
+    shots, path = pictures(steps=30), tmp_path / "a.gif"
+    animation.write(shots, path, 10, lambda: None)
+    with image_module.open(path) as image:
+        image.seek(image.n_frames - 1)
+        shown = np.asarray(image.convert("RGB")).reshape(-1, 3)
+    for colour in (animation.ARRIVED, animation.LOST):
+        assert (np.abs(shown.astype(int) - colour).max(axis=1) <= 1).any(), colour
+
+
 def test_view_writes_mp4(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     import imageio_ffmpeg
