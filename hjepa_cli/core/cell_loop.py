@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from hjepa_cli.core.disagreement import Levels, calibrate_levels
 from hjepa_cli.core.growth import Growth, conformal_growth
 from hjepa_cli.core.loop import (
-    STATE_LIMIT,
     Controller,
-    Sensor,
+    World,
     device_draws,
     noise_per_step,
 )
@@ -25,7 +24,6 @@ from hjepa_cli.core.methods import Method
 from hjepa_cli.core.metrics import control_error
 from hjepa_cli.core.system import Bools, Floats, System
 from hjepa_cli.core.uplink import Access, Uplink
-from hjepa_cli.errors import NumericalError
 from hjepa_cli.settings import ProtocolSettings
 
 CHUNK_STEPS = 256
@@ -82,7 +80,7 @@ def simulate_cell(
     Raises:
         NumericalError: the controller returned a force that is not finite.
     """
-    uplink, world = Uplink(access, devices), World(plant, protocol, seed, devices)
+    uplink, world = Uplink(access, devices), World(plant, *streamed_draws(protocol, devices, seed))
     controller: Any = method.controller(devices)
     packets, steps = np.zeros(devices, dtype=np.int64), protocol.steps
     for k in range(steps):
@@ -142,7 +140,7 @@ def _without_packets(
     longest = min(longest, protocol.steps - 1)
     wanted = sorted({1, 2, longest, *np.geomspace(4, longest, 20).astype(int).tolist()})
     ages = [age for age in wanted if age <= longest]
-    world = World(plant, protocol, seed, devices)
+    world = World(plant, *streamed_draws(protocol, devices, seed))
     controller: Any = method.controller(devices)
     everybody, nobody = np.ones(devices, dtype=bool), np.zeros(devices, dtype=bool)
     world.move(controller.act(everybody, world.sense(method.sensor, everybody)))
@@ -154,43 +152,6 @@ def _without_packets(
             apart.append(np.array(getattr(controller, "apart", np.zeros(devices))))
         world.move(controller.act(nobody, None))
     return ages, np.stack(errors, axis=1), np.stack(apart, axis=1)
-
-
-class World:
-    """The plants of a cell, driven by the draws of a seed.
-
-    Attributes:
-        score, cost: sums over the steps so far [N].
-    """
-
-    def __init__(self, plant: System, protocol: ProtocolSettings, seed: int, devices: int) -> None:
-        initial, mass_scale, self._noise = streamed_draws(protocol, devices, seed)
-        self._plant = plant
-        self._plants = plant.simulation(devices, mass_scale=mass_scale)
-        self._plants.states = initial
-        self._previous = initial
-        self._plants.step(plant.no_force(devices))  # the camera needs the frame before k = 0
-        self._states = self._plants.states
-        self.score, self.cost = np.zeros(devices), np.zeros(devices)
-
-    def sense(self, sensor: Sensor, devices: Bools) -> Any:
-        """Packets of some devices; ``None`` where there are none."""
-        if not devices.any():
-            return None
-        return sensor(self._previous[devices], self._states[devices])
-
-    def move(self, forces_n: Floats) -> None:
-        """Score this step and go on to the next."""
-        if not np.isfinite(forces_n).all():
-            raise NumericalError("the controller's force is not finite")
-        limit_n = self._plant.force_limit_n
-        forces_n = np.clip(forces_n, -limit_n, limit_n)
-        self.score += self._plant.in_band(self._states)
-        self.cost += self._plant.cost(self._states, forces_n)
-        self._previous = self._states
-        self._plants.step(forces_n)
-        moved = self._plants.states + next(self._noise)
-        self._plants.states = self._states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
 
 
 def streamed_draws(

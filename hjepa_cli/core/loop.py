@@ -12,7 +12,7 @@ Devices N and curve points P (different link schedules on the same draws) share 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -211,30 +211,69 @@ def simulate(
     """
     points, steps, devices = delivered.shape
     assert (steps, devices) == draws.delivery.shape, (delivered.shape, draws.delivery.shape)
-    mass_scale = np.tile(draws.mass_scale, (points, 1))
-    world = plant.simulation(points * devices, mass_scale=mass_scale)
-    world.states = np.tile(draws.initial, (points, 1))
-    previous = world.states
-    world.step(plant.no_force(points * devices))  # the camera needs the frame before k = 0
-    score, cost = np.zeros(points * devices), np.zeros(points * devices)
+    initial, mass_scale = (
+        np.tile(drawn, (points, 1)) for drawn in (draws.initial, draws.mass_scale)
+    )
+    noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
+    world = World(plant, initial, mass_scale, noise)
     for k in range(steps):
-        states = world.states
-        sent = delivered[:, k].reshape(-1)
-        packets = sensor(previous[sent], states[sent]) if sent.any() else None
-        forces = controller.act(sent, packets)
-        if not np.isfinite(forces).all():
-            raise NumericalError(f"the controller's force is not finite at step {k}")
-        forces = np.clip(forces, -plant.force_limit_n, plant.force_limit_n)
-        score += plant.in_band(states)
-        cost += plant.cost(states, forces)
-        watch(k, states, forces)
-        previous = states
-        world.step(forces)
-        moved = world.states.reshape(points, devices, -1) + draws.noise[k]
-        world.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT).reshape(states.shape)
+        states, sent = world.states, delivered[:, k].reshape(-1)
+        watch(k, states, world.move(controller.act(sent, world.sense(sensor, sent))))
         tick()
     shape = (points, devices)
-    return Outcome(score.reshape(shape) / steps, cost.reshape(shape) / steps)
+    return Outcome(world.score.reshape(shape) / steps, world.cost.reshape(shape) / steps)
+
+
+class World:
+    """Plants that go on step by step, each step scored.
+
+    Args:
+        plant: of all devices.
+        initial: states at k = -1 [N, S]; the camera needs the frame before k = 0.
+        mass_scale: of each device [N, 2].
+        noise: added to the states [N, S] after one step after the other.
+
+    Attributes:
+        states: now [N, S].
+        score, cost: sums over the steps so far [N].
+    """
+
+    def __init__(
+        self, plant: System, initial: Floats, mass_scale: Floats, noise: Iterator[Floats]
+    ) -> None:
+        devices = len(initial)
+        self._plant, self._noise = plant, noise
+        self._plants = plant.simulation(devices, mass_scale=mass_scale)
+        self._plants.states = initial
+        self._previous = self._plants.states
+        self._plants.step(plant.no_force(devices))
+        self.states = self._plants.states
+        self.score, self.cost, self._step = np.zeros(devices), np.zeros(devices), 0
+
+    def sense(self, sensor: Sensor, devices: Bools) -> Any:
+        """Packets of some devices; ``None`` where there are none."""
+        if not devices.any():
+            return None
+        return sensor(self._previous[devices], self.states[devices])
+
+    def move(self, forces_n: Floats) -> Floats:
+        """Score this step and go on to the next; returns the forces as applied [N, *A].
+
+        Raises:
+            NumericalError: a force is not finite.
+        """
+        if not np.isfinite(forces_n).all():
+            raise NumericalError(f"the controller's force is not finite at step {self._step}")
+        forces_n = np.clip(forces_n, -self._plant.force_limit_n, self._plant.force_limit_n)
+        self.score += self._plant.in_band(self.states)
+        self.cost += self._plant.cost(self.states, forces_n)
+        self._previous = self.states
+        self._plants.step(forces_n)
+        moved = self._plants.states + next(self._noise)
+        self._plants.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
+        self.states = self._plants.states
+        self._step += 1
+        return forces_n
 
 
 def play(controller: Controller, packets: Any, devices: int, steps: int) -> Floats:
