@@ -45,8 +45,8 @@ NASTY = [
 ]  # fmt: skip
 ARCHITECTURE = {
     "kind": "hierarchy", "embedding": 8, "hidden": 8, "frame_input": "difference", "centre": True,
-    "stride_actions": "all", "residual": True, "h": 4, "m": 2, "l": 1, "actor_hidden": 8,
-    "actor_dropout": 0.1,
+    "stride_actions": "all", "residual": True, "mirror": "exact", "h": 4, "m": 2, "l": 1,
+    "actor_hidden": 8, "actor_dropout": 0.1,
 }  # fmt: skip
 METADATA = {
     "stage": "train-hierarchy",

@@ -121,7 +121,7 @@ def run(root: Path, *words: str, size: int = 2, prepare: Prepare | None = None) 
     """Exit codes of a command on ``size`` processes."""
     started = start(root, list(words), size, prepare)
     for process in started:
-        process.join(120)
+        process.join(900)
     return [process.exitcode for process in started]
 
 
@@ -173,7 +173,7 @@ def test_torchrun_trains_what_one_process_trains(place: Path) -> None:
     command += ["--master-port", str(free_port()), "-m", "hjepa_cli", "train-encoder"]
     command += ["--dataset", "data", "--config", "sgd.toml", "--out", "torchrun", "--json"]
     ended = subprocess.run(
-        command, cwd=place, env=ENVIRONMENT, capture_output=True, text=True, timeout=120
+        command, cwd=place, env=ENVIRONMENT, capture_output=True, text=True, timeout=900
     )
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout)["checkpoint"] == "torchrun/model.safetensors"
@@ -284,7 +284,7 @@ def test_batch_norm_of_several_processes_is_that_of_one() -> None:
     for child in children:
         child.start()
     for child in children:
-        child.join(60)
+        child.join(900)
     assert [child.exitcode for child in children] == [0, 0]
 
 
