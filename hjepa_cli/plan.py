@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from hjepa_cli.stages.evaluate import Subject
 
 FRAME_BYTES = 64 * 128 * 3
-ENCODER_PARAMETERS = 1_500_000
+ENCODER_PARAMETERS = 700_000
 RATES_PER_S = {  # two cores of a server CPU
     "simulated steps": 400_000.0,
     "rendered frames": 6_000.0,
-    "encoder training frames": 400.0,
+    "encoder training frames": 500.0,
     "encoded frames": 3_000.0,
-    "level training steps": 8.0,
+    "level training steps": 10.0,
     "closed-loop frames": 3_500.0,
     "device-steps on embeddings": 50_000.0,
     "device-steps on states": 300_000.0,
@@ -313,7 +313,8 @@ def _frames(settings: Settings) -> int:
 def _predictor(settings: Settings, actions: int) -> int:
     """Parameters of an anchored predictor, the largest kind."""
     inputs = 2 * settings.encoder.embedding + actions + 1
-    return (inputs + 1 + settings.encoder.embedding) * settings.encoder.hidden
+    parameters = (inputs + 1 + settings.encoder.embedding) * settings.encoder.hidden
+    return parameters // 2 if settings.encoder.mirror == "exact" else parameters
 
 
 def _subject(settings: Settings, checkpoint: str | None, dataset: Path | None) -> "Subject":

@@ -198,10 +198,10 @@ def _norm(channels: int, symmetric: bool) -> nn.BatchNorm2d:
 
 def _fold(module: nn.Module, convolution: str, norm: str) -> None:
     """Move one batch norm's running statistics and affine part into its convolution, for good."""
-    pair = [getattr(module, name) for name in (convolution, norm)]
-    ordinary = [
-        layer.ordinary() if isinstance(layer, MirrorConv2d | MirrorNorm2d) else layer
-        for layer in pair
-    ]
-    setattr(module, convolution, fuse_conv_bn_eval(*ordinary))
+    conv, batch_norm = getattr(module, convolution), getattr(module, norm)
+    if isinstance(conv, MirrorConv2d):
+        conv = conv.ordinary()
+    if isinstance(batch_norm, MirrorNorm2d):
+        batch_norm = batch_norm.ordinary()
+    setattr(module, convolution, fuse_conv_bn_eval(conv, batch_norm))
     setattr(module, norm, nn.Identity())
