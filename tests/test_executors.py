@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from command_line import ENVIRONMENT, Shell, assert_one_line_error, open_shell
+from test_evaluate import untrained
 
 from hjepa_cli.core import executors
 from hjepa_cli.core.executors import InProcess, finished, open_executor, placed
@@ -146,21 +147,19 @@ def test_a_dataset_is_the_same_from_any_number_of_workers_and_from_a_cluster(
 
 @pytest.mark.slow
 def test_a_sweep_is_the_same_from_any_number_of_workers_and_from_a_cluster(
-    cluster: Cluster,
+    cluster: Cluster, tmp_path: Path
 ) -> None:
     """50 signal-to-noise ratios by 4 methods: 200 cells, four times the same CSV."""
     if len(cluster.workers) < 2:
         cluster.workers.append(cluster.start_worker())
-    found = []
+    found, model = [], str(untrained(tmp_path / "model.safetensors"))
     for name, place in places(cluster).items():
         out, killer = Path(name), None
         if name == "killed":
             cluster.wait()
             killer = cluster.kill_worker(out / "curves.json", out / "result.json")
         with place:
-            result = scale.run(
-                SETTINGS, SCREEN, checkpoint="desktop-h4m2l1", out=out, remeasure=True
-            )
+            result = scale.run(SETTINGS, SCREEN, checkpoint=model, out=out, remeasure=True)
         if killer:
             killer.join()
             assert cluster.midway

@@ -161,7 +161,7 @@ def assert_close_runs(several: Path, one: Path) -> None:
         sum(float(np.square(theirs.tensors[name] - other[name]).sum()) for name in weights) ** 0.5
         for other in (start, ours.tensors)
     )
-    assert apart < 0.01 * moved
+    assert apart < 0.03 * moved  # most of it by the variances of the one process
     assert len(losses(one)) == 2
     np.testing.assert_allclose(losses(several), losses(one), rtol=TOLERANCE, atol=TOLERANCE)
 
