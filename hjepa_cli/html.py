@@ -18,13 +18,14 @@ PAGE = Template("""<!DOCTYPE html>
 <title>$title</title>
 <style>
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
-       max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
+       max-width: 64rem; margin: 2rem auto; padding: 0 1rem; }
 h1, h2, h3 { line-height: 1.2; } h2 { border-top: 1px solid #ccc; padding-top: 1rem; }
 .table { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; font-size: 0.85rem; }
-th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: right;
+table { border-collapse: collapse; font-size: 0.8rem; }
+th, td { padding: 0.2rem 0.45rem; border-bottom: 1px solid #ddd; text-align: right;
          white-space: nowrap; }
-th.text, td.text, th:first-child, td:first-child { text-align: left; white-space: normal; }
+th.text, td.text, th:first-child, td:first-child { text-align: left; }
+td.text:not(:first-child) { white-space: normal; }
 pre, code { background: #f5f5f5; font-size: 0.85rem; } pre { padding: 0.6rem; overflow-x: auto; }
 figure { margin: 1rem 0; display: inline-block; vertical-align: top; max-width: 27rem; }
 figure img { width: 100%; } figcaption { color: #555; font-size: 0.9rem; }

@@ -90,9 +90,9 @@ def stage(monkeypatch):
 def test_help_answers_at_once_without_heavy_imports(command):
     """Half a second of processor time at most, in the best of a few runs.
 
-    Where that is missed, the machine may be slow today: then help may take twice what starting
-    Python with nothing but the command-line library takes. Tools of this kind that import torch
-    at the top take seconds to say what their flags are.
+    Where that is missed, the machine may be slow today: then help may take three times what
+    starting Python with nothing but the command-line library takes. Tools of this kind that import
+    torch at the top take seconds to say what their flags are.
     """
     code = (
         "import sys\n"
@@ -109,7 +109,7 @@ def test_help_answers_at_once_without_heavy_imports(command):
         if help_s < HELP_LIMIT_S:
             return
         library_s = min(library_s, timed("-c", "import typer.rich_utils, rich.progress")[1])
-        if help_s < 2 * library_s:
+        if help_s < 3 * library_s:
             return
     pytest.fail(f"help took {help_s:.2f} s, the library alone {library_s:.2f} s")
 
