@@ -32,19 +32,23 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torch.utils.data import DataLoader, Dataset
 
 from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.ema import EmaTarget
-from hjepa_cli.core.encoder import CENTRE_OFFSET, Encoder, normalise
+from hjepa_cli.core.encoder import STEM_PX, Encoder, normalise
 from hjepa_cli.core.hierarchy import rollout_loss
 from hjepa_cli.core.jepa import Jepa
 from hjepa_cli.core.losses import InverseDynamics
+from hjepa_cli.core.model import build_modules
 from hjepa_cli.core.predictors import Predictor
+from hjepa_cli.core.symmetry import flatten_twins
 from hjepa_cli.core.training import Optimiser, autocast
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.stages.train_encoder import describe_architecture
 
 TRAJECTORIES = 40
 PLAIN_ITEMS = 20  # about as many frames per step as the other loops encode
@@ -75,10 +79,10 @@ class PlainEncoder(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         net = self.encoder
-        x = torch.relu(net.stem_norm(net.stem(x)))
+        x = torch.relu(net.stem_norm(F.conv2d(x, *net._stem(), stride=STEM_PX)))
         x = torch.relu(net.squeeze(net.stages(x)))
-        z = net.head(x.flatten(1))
-        return normalise(z if net.centre is None else net.centre(z) + CENTRE_OFFSET)
+        z = net.head(flatten_twins(x) if net.symmetric else x.flatten(1))
+        return normalise(z if net.centre is None else net.centre(z) + net.offset)
 
 
 class Windows(Dataset[tuple[Tensor, Tensor]]):
@@ -118,10 +122,10 @@ class PlainTraining:
         options = settings.encoder
         self.batches, self.starts, self.horizon = batches(data, size), starts, horizon
         self.weight = options.inverse_dynamics
-        self.encoder = PlainEncoder(Encoder(options.embedding, options.frame_input, options.centre))
+        encoder, self.predictor, mirror = networks(settings)
+        self.encoder = PlainEncoder(encoder)
         self.target = EmaTarget(self.encoder, options.ema_decay)
-        self.predictor = Predictor(options.embedding, options.hidden, options.h)
-        self.inverse = InverseDynamics(options.embedding)
+        self.inverse = InverseDynamics(options.embedding, mirror=mirror)
         modules = (self.encoder, self.predictor, self.inverse)
         self.optimiser = optimiser(p for module in modules for p in module.parameters())
 
@@ -137,6 +141,14 @@ class PlainTraining:
         )
         self.optimiser.step(prediction + self.weight * inverse, 0)
         self.target.update(self.encoder)
+
+
+def networks(settings: Settings) -> tuple[Encoder, Predictor, tuple[float, ...] | None]:
+    """What ``train-encoder`` trains, and what a mirror does to the force."""
+    modules = build_modules(describe_architecture(settings))
+    encoder, predictor = modules["encoder"], modules["high"]
+    assert isinstance(encoder, Encoder) and isinstance(predictor, Predictor)
+    return encoder, predictor, (-1.0,) if settings.encoder.mirror == "exact" else None
 
 
 def optimiser(parameters: Iterator[nn.Parameter]) -> Optimiser:
@@ -164,13 +176,15 @@ def build_loops(settings: Settings) -> dict[str, Loop]:
     actions = torch.from_numpy(data.applied_n / 20.0)
 
     count, horizon = options.batch_trajectories, options.rollout_steps // options.h
+    encoder, predictor, mirror = networks(settings)
     jepa = Jepa(
-        Encoder(options.embedding, options.frame_input, options.centre),
-        Predictor(options.embedding, options.hidden, options.h),
+        encoder,
+        predictor,
         ema_decay=options.ema_decay,
         inverse_dynamics=options.inverse_dynamics,
         rollout_strides=horizon,
         device=CPU,
+        mirror=mirror,
     )
     update = optimiser(jepa.parameters())
     windows = FrameWindows(
@@ -178,7 +192,7 @@ def build_loops(settings: Settings) -> dict[str, Loop]:
         actions,
         window_frames=options.batch_frames,
         stride=options.h,
-        mirror=options.mirror,
+        mirror=options.mirror == "augment",
         shift_px=options.shift_px,
     )
     stream = np.random.default_rng(0)

@@ -15,6 +15,7 @@ from hjepa_cli.core.symmetry import (
     Signs,
     Twins,
     flatten_twins,
+    force_signs,
     reflect,
 )
 
@@ -51,8 +52,11 @@ def mirrored_maps(x: Tensor) -> Tensor:
 def test_a_linear_layer_from_signs_to_twins_and_back(factors: tuple[float, ...]) -> None:
     torch.manual_seed(0)
     signs = torch.tensor(factors)
-    into = MirrorLinear(Signs(factors), Twins(10))
-    between, back = MirrorLinear(Twins(10), Twins(6)), MirrorLinear(Twins(6), Signs(factors))
+    into = MirrorLinear(Signs(force_signs(factors)), Twins(10))
+    between, back = (
+        MirrorLinear(Twins(10), Twins(6)),
+        MirrorLinear(Twins(6), Signs(force_signs(factors))),
+    )
     x = torch.randn(5, len(factors))
     torch.testing.assert_close(into(signs * x), swap(into(x)), **TOLERANCE)
     hidden = into(x)
@@ -70,7 +74,7 @@ def test_any_linear_map_that_commutes_with_the_mirror_can_be_expressed() -> None
     signs = torch.tensor([1.0, -1.0, 1.0])
     matrix = torch.randn(4, 3)
     commuting = (matrix + swap(matrix, dim=0) * signs) / 2
-    layer = MirrorLinear(Signs(signs.tolist()), Twins(4))
+    layer = MirrorLinear(Signs(force_signs(signs.tolist())), Twins(4))
     with torch.no_grad():
         assert layer.even is not None and layer.odd is not None
         layer.even.bias.zero_()

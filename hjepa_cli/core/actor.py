@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs
+from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs, force_signs
 
 SECOND_HIDDEN = 256
 
@@ -38,7 +38,7 @@ class Actor(nn.Module):
             linear = [
                 MirrorLinear(Signs(embedding_signs(embedding)), first),
                 MirrorLinear(first, second),
-                MirrorLinear(second, Signs(mirror)),
+                MirrorLinear(second, Signs(force_signs(mirror))),
             ]
         self.layers = nn.Sequential(
             *(linear[0], nn.ReLU(), nn.Dropout(dropout)),

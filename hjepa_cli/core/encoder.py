@@ -117,7 +117,8 @@ class Encoder(nn.Module):
             signs = embedding_signs(embedding)
             self.head = MirrorLinear(Twins(features), Signs(signs))
             self.centre = MirrorCentre(embedding)
-            offset = 2**0.5 * (torch.tensor(signs) > 0)  # a reflection must not change it
+            offset[: embedding // 2] *= 2**0.5  # a reflection must not change it
+            offset[embedding // 2 :] = 0.0
         if not centre:
             self.centre = None
         self.register_buffer("offset", offset, persistent=False)

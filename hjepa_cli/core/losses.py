@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs
+from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs, force_signs
 
 
 def cosine_loss(predicted: Tensor, target: Tensor) -> Tensor:
@@ -42,7 +42,8 @@ class InverseDynamics(nn.Module):
         if mirror is not None:
             units = Twins(2 * hidden)
             z = embedding_signs(embedding)
-            linear = [MirrorLinear(Signs(z + z), units), MirrorLinear(units, Signs(mirror))]
+            played = Signs(force_signs(mirror))
+            linear = [MirrorLinear(Signs(z + z), units), MirrorLinear(units, played)]
         self.layers = nn.Sequential(linear[0], nn.ReLU(), linear[1])
 
     def loss(self, z: Tensor, z_next: Tensor, action: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hjepa_cli.core.encoder import normalise
-from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs
+from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs, force_signs
 
 
 class Predictor(nn.Module):
@@ -49,8 +49,8 @@ class Predictor(nn.Module):
         self.output: nn.Module = nn.Linear(hidden, embedding)
         if mirror is not None:
             z = embedding_signs(embedding)
-            forces = tuple(mirror) * (actions // len(mirror))
-            signs = z + forces + (z if anchored else ()) + (1.0,) * self.sees_distance
+            signs = z + force_signs(mirror) * (actions // len(mirror))
+            signs += (z if anchored else ()) + ((1, 1.0),) * self.sees_distance
             self.hidden = MirrorLinear(Signs(signs), Twins(hidden))
             self.output = MirrorLinear(Twins(hidden), Signs(z))
         if residual:

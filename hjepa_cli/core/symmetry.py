@@ -23,9 +23,18 @@ from torch.nn.modules.batchnorm import _BatchNorm
 HALF = 0.5**0.5
 
 
-def embedding_signs(embedding: int) -> tuple[float, ...]:
+Runs = tuple[tuple[int, float], ...]
+"""What a mirror does to consecutive values: how many, times 1 or −1; then the next ones."""
+
+
+def embedding_signs(embedding: int) -> Runs:
     """What a mirror does to an embedding of D values: the first half is even, the second odd."""
-    return (1.0,) * (embedding // 2) + (-1.0,) * (embedding // 2)
+    return ((embedding // 2, 1.0), (embedding - embedding // 2, -1.0))
+
+
+def force_signs(mirror: Sequence[float]) -> Runs:
+    """What a mirror does to forces, from a factor for each."""
+    return tuple((1, factor) for factor in mirror)
 
 
 def reflect(z: Tensor) -> Tensor:
@@ -38,18 +47,23 @@ class Signs(nn.Module):
     """Vectors [..., n] of which a mirror changes some signs.
 
     Args:
-        factors: 1 or −1 for each value.
+        runs: which.
     """
 
     order: Tensor
 
-    def __init__(self, factors: Sequence[float]) -> None:
+    def __init__(self, runs: Runs) -> None:
         super().__init__()
-        even = [i for i, factor in enumerate(factors) if factor > 0]
-        odd = [i for i, factor in enumerate(factors) if factor <= 0]
-        self.even, self.odd = len(even), len(odd)
-        self._sorted = even + odd == list(range(len(factors)))
-        self.register_buffer("order", torch.tensor(even + odd), persistent=False)
+        parts: dict[bool, list[Tensor]] = {True: [], False: []}
+        start = 0
+        for count, factor in runs:
+            parts[factor > 0].append(torch.arange(start, start + count))
+            start += count
+        self.even, self.odd = (sum(map(len, parts[kind])) for kind in (True, False))
+        order = torch.cat([*parts[True], *parts[False]])
+        kinds = [factor > 0 for _, factor in runs]
+        self._sorted = kinds == sorted(kinds, reverse=True)
+        self.register_buffer("order", order, persistent=False)
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """[..., n] → even part [..., n_even], odd part [..., n_odd]."""

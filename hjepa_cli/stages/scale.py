@@ -269,11 +269,12 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
             ],
         )
     for found in result["gains"]:
+        paper = f"; the paper: up to +{result['paper_gain_percent']} %"  # over one-step TS-JEPA
         screen.result(
             f"{found['method']} over {found['over']} at {found['snr_db']:g} dB: "
             f"{_percent(found['ratio'])} devices "
-            f"(95 % CI {' to '.join(_percent(end) for end in found['ratio_ci95'])}); "
-            f"the paper: up to +{result['paper_gain_percent']} %"
+            f"(95 % CI {' to '.join(_percent(end) for end in found['ratio_ci95'])})"
+            + (paper if found["over"] == "ts-jepa-1" else "")
         )
     for method, (row, *_) in ranked:
         if row["reason"]:
