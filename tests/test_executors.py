@@ -39,6 +39,7 @@ SETTINGS = load_settings(
         "protocol.curve_devices": 4,
         "protocol.bracket_devices": 40,
         "protocol.gaps": [1, 4, 16],
+        "protocol.bracket": 0.3,
         "protocol.horizon": 8,
         "protocol.bootstrap": 20,
         "radio.snr_db": "0:49:1",

@@ -5,6 +5,7 @@ them, a thousand in all, and shrinks what fails.
 """
 
 import random
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -92,8 +93,12 @@ def test_an_architecture_is_not_built_before_its_tensors_are_seen(
     chance = random.Random(0)
     chance.choice = lambda options: options[0]  # type: ignore[method-assign]
     (tmp_path / "a").write_bytes(fuzz.seal(arrays, metadata, chance))
+    tracemalloc.start()
     with pytest.raises(DataError):
         Model.load(tmp_path / "a", "cpu")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2 * (tmp_path / "a").stat().st_size + fuzz.OVERHEAD_BYTES
     (tmp_path / "a").write_bytes(fuzz.seal(arrays, fuzz.METADATA, chance))
     Model.load(tmp_path / "a", "cpu")
 

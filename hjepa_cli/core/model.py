@@ -77,6 +77,12 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
     """
     metadata = check_metadata(checkpoint)
     architecture, kind = metadata["architecture"], plant(metadata["plant"])
+    largest = max((array.size for array in checkpoint.tensors.values()), default=0)
+    for name, value in architecture.items():
+        if isinstance(value, int) and value > largest:
+            raise DataError(
+                f"checkpoint {checkpoint.path}: {name} = {value}, but no tensor has so many values"
+            )
     try:
         with torch.device("meta"):
             planned = build_modules(architecture, kind.action_shape, kind.force_signs).state_dict()
