@@ -204,7 +204,9 @@ def test_embeddings_keep_trajectories_and_steps_apart(every: int, mirrored: bool
 def test_mirror_images_come_with_negated_actions_and_labels() -> None:
     split = painted(4, 10)
     settings = load_settings(flags={"device": "cpu"})
-    (plain, labels), (mirrored, mirrored_labels) = embed_all(Reader(), split, settings, QUIET)
+    (plain, labels), (mirrored, mirrored_labels) = embed_all(
+        Reader(), split, settings, QUIET, flip=True
+    )
     assert torch.equal(mirrored.z[..., 0], plain.z[..., 0] + 100)
     assert torch.equal(plain.actions, split.actions) and torch.equal(labels, split.labels)
     assert torch.equal(mirrored.actions, -split.actions)
