@@ -65,6 +65,17 @@ STYLES = {
     "oracle": Style("#000000", "o", "-", hollow=True),
     "hold-true": Style("#7F7F7F", "v", ":", hollow=True),
     "zero-true": Style("#7F7F7F", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
+    "optimal": Style("#000000", "x", ":"),
+    "ts-jepa-2": Style("#66C2A5", "<", "-."),
+    "ts-jepa-3": Style("#41AE76", ">", "-."),
+    "ts-jepa-5": Style("#00441B", "h", "-."),
+    "supervised-2": Style("#8C510A", "P", "--"),
+    "supervised-4": Style("#BF812D", "X", "--"),
+    "autoencoder-2": Style("#DFC27D", "p", "--"),
+    "linear": Style("#56B4E9", "d", (0, (5, 1))),
+    "state-kf": Style("#7B3294", "*", (0, (5, 1)), hollow=True),
+    "state-48": Style("#C2A5CF", "p", (0, (5, 1)), hollow=True),
+    "local": Style("#404040", "+", ":"),
 }
 OTHERS = [Style("#56B4E9", marker, "--") for marker in "PX<>phd*"]
 LONGEST_OF_THREE = 15  # characters of a label, for three columns of a legend
@@ -106,7 +117,7 @@ def devices_figure(
         for method, points in sorted(curves.items(), key=lambda item: -item[1][-1, 1]):
             label = method if points[:, 1].any() else f"{method} (0)"
             label += " (at least)" if method in bounds else ""
-            _draw(axes, label, points, _style(method, list(curves)))
+            _draw(axes, label, points, method_style(method, list(curves)))
         _scale_counts(axes, [row for row in rows if row["devices"]])
         axes.set_xlabel(snr_label)
         axes.set_ylabel("Supported devices")
@@ -191,7 +202,8 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     return {method: np.array(sorted(points), float) for method, points in curves.items()}
 
 
-def _style(method: str, methods: list[str]) -> Style:
+def method_style(method: str, methods: list[str]) -> Style:
+    """How a method is drawn; ``methods`` are all of the figure, so that none shares a marker."""
     others = [name for name in methods if name not in STYLES]
     return STYLES.get(method) or OTHERS[others.index(method) % len(OTHERS)]
 
@@ -287,7 +299,7 @@ def score_figure(
             where = [1e3 * step_s * point["d"] if kind == "gap" else point["p"] for point in curve]
             band = np.array([point["ci95"] for point in curve], float)
             scores = np.array([point["score"] for point in curve], float)
-            _line(axes, method, list(entries), np.array(where), scores, band)
+            draw_line(axes, method, list(entries), np.array(where), scores, band)
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -321,7 +333,7 @@ def error_figure(
             if errors.max() < ZERO_ERROR:
                 continue  # oracle and optimal know the noise-free future but for rounding
             band = np.array(entry["nmae_ci95"], float)
-            _line(axes, method, list(entries), 1e3 * step_s * np.arange(len(errors)), errors, band)
+            draw_line(axes, method, list(entries), 1e3 * step_s * np.arange(len(errors)), errors, band)
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
@@ -381,12 +393,12 @@ def _series(rows: Sequence[Mapping[str, str]], prefix: str) -> dict[str, list[tu
     return series
 
 
-def _line(
+def draw_line(
     axes: Axes, method: str, methods: list[str], where: np.ndarray, value: np.ndarray,
     band: np.ndarray,
 ) -> None:  # fmt: skip
-    """One method's line, markers and band [points, 2]."""
-    style = _style(method, methods)
+    """Draw one method's line, markers and 95 % band [points, 2] over ``where``."""
+    style = method_style(method, methods)
     axes.plot(
         where,
         value,

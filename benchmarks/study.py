@@ -1,0 +1,208 @@
+"""Train variations of a recipe with the shipped commands and compare them in one table.
+
+    python benchmarks/study.py ablations --out study             # one seed
+    python benchmarks/study.py seeds --seeds 0,1,2,3,4 --out study
+
+A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and rows, each a name and
+the settings in which it differs from the preset. A row without settings of the training stages and
+with a ``checkpoint`` only measures that one.
+
+Everything is kept below ``--out`` in directories named after what they depend on, so rows share what
+they can (one dataset, one encoder), an interrupted study goes on with the same command, and a study
+with more seeds or rows only adds to it. The table goes to the screen and to ``OUT/STUDY.md``, all
+numbers to ``OUT/STUDY.json``. With several seeds the intervals are Student's over seeds; with one,
+the bootstrap's over devices or rollouts, and they say nothing about another training.
+"""
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+STUDIES = Path(__file__).parent / "studies"
+PROBES = ("x", "x_dot", "theta", "theta_dot")
+SECTIONS_OF = {  # a stage's results depend on these settings, and on the stages before
+    "collect": ("collect",),
+    "train-encoder": ("collect", "encoder", "actor"),
+    "train-hierarchy": ("collect", "encoder", "actor", "hierarchy"),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("study", choices=sorted(path.stem for path in STUDIES.glob("*.toml")))
+    parser.add_argument("--seeds", default="0", help="comma-separated")
+    parser.add_argument("--out", type=Path, default=Path("study"))
+    parser.add_argument("--rows", help="only these rows, by name, separated by ;")
+    arguments = parser.parse_args()
+    study = tomllib.loads((STUDIES / f"{arguments.study}.toml").read_text())
+    rows, methods = study["row"], study["methods"]
+    if arguments.rows:
+        wanted = [name.strip() for name in arguments.rows.split(";")]
+        unknown = set(wanted) - {row["name"] for row in rows}
+        if unknown:
+            names = "; ".join(row["name"] for row in rows)
+            parser.error(f"no row {', '.join(sorted(unknown))}; choose from {names}")
+        rows = [row for row in rows if row["name"] in wanted]
+    seeds = [int(seed) for seed in arguments.seeds.split(",")]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    measured: dict[str, dict[int, dict[str, Any]]] = {}
+    for seed in seeds:  # all rows of a seed before the next: comparisons are within a seed
+        for row in rows:
+            print(f"{row['name']}, seed {seed}", file=sys.stderr, flush=True)
+            result = measure(row, seed, row.get("methods", methods), arguments.out)
+            measured.setdefault(row["name"], {})[seed] = result
+            write(measured, arguments.out / arguments.study)
+    print((arguments.out / f"{arguments.study}.md").read_text())
+
+
+def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> dict[str, Any]:
+    """Train what the row needs and evaluate it: ``eval``'s methods and the encoder's health."""
+    changes = {key: value for key, value in row.items() if isinstance(value, dict)}
+    preset = row.get("preset", "default")
+
+    def directory(stage: str, *more: Any) -> Path:
+        sections = {name: changes.get(name, {}) for name in SECTIONS_OF.get(stage, changes)}
+        # A preset other than the default may change any section.
+        described = json.dumps([preset, sections, seed, *more], sort_keys=True)
+        return out / f"{stage}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
+
+    config = out / f"{directory('config').name}.toml"
+    config.write_text(as_toml(changes))
+    common = ["--preset", preset, "--config", str(config), "--seed", str(seed)]
+    checkpoint: str | Path
+    if "checkpoint" in row:
+        checkpoint, health = row["checkpoint"], {}
+    else:
+        data, encoder, checkpoint = map(directory, SECTIONS_OF)
+        hjepa("collect", *common, "--out", data)
+        trained = hjepa(
+            *("train-encoder", *common, "--no-gate", "--dataset", data, "--out", encoder)
+        )
+        h, m, l = row.get("strides", (None, None, None))
+        strides = [f"--{name}={value}" for name, value in zip("hml", (h, m, l), strict=True) if value]
+        checkpoint = directory("train-hierarchy", row.get("strides"))
+        hjepa(
+            *("train-hierarchy", *common, *strides),
+            *("--dataset", data, "--encoder", encoder, "--out", checkpoint),
+        )
+        health = trained["health"]
+    evaluated = hjepa(
+        *("eval", *common, "--checkpoint", checkpoint, "--methods", ",".join(methods)),
+        *("--out", directory("eval", row.get("strides"), str(row.get("checkpoint")), methods)),
+    )
+    return {"health": health, "methods": evaluated["methods"]}
+
+
+def hjepa(*words: object) -> dict[str, Any]:
+    """The document of a command; its screen goes to ours. A failing command ends the study."""
+    command = [sys.executable, "-m", "hjepa_cli", *map(str, words), "--json"]
+    ended = subprocess.run(command, stdout=subprocess.PIPE, check=False)
+    if ended.returncode:
+        print("failed: hjepa", *words, "\n" + ended.stdout.decode(), file=sys.stderr)
+        sys.exit(ended.returncode)
+    document: dict[str, Any] = json.loads(ended.stdout)
+    return document
+
+
+def as_toml(sections: dict[str, dict[str, Any]]) -> str:
+    """Sections of plain values as TOML; JSON writes those alike."""
+    return "".join(
+        f"[{section}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
+        for section, values in sections.items()
+    )
+
+
+def write(measured: dict[str, dict[int, dict[str, Any]]], path: Path) -> None:
+    """``PATH.json`` with everything and ``PATH.md`` with the table."""
+    path.with_suffix(".json").write_text(json.dumps(measured, indent=1))
+    windows = windows_of(measured)
+    head = ["row", "method", "n", *(f"R² {name}" for name in PROBES), "actor NRMSE"]
+    head += [*(f"NMAE {window}" for window in windows), "gap D* [steps]"]
+    lines = [head, ["---"] * len(head)]
+    for name, by_seed in measured.items():
+        methods = next(iter(by_seed.values()))["methods"]
+        for method in methods:
+            health = [result["health"] for result in by_seed.values()]
+            entries = [result["methods"][method] for result in by_seed.values()]
+            lines.append(
+                [
+                    *(name, method, str(len(entries))),
+                    *(
+                        over_seeds([report["probe_r2"][probe] for report in health if report], 3)
+                        for probe in PROBES
+                    ),
+                    over_seeds([report["actor_nrmse"] for report in health if report], 3),
+                    *(
+                        over_seeds(
+                            [entry["nmae_windows"][window] for entry in entries],
+                            4,
+                            entries[0]["nmae_windows_ci95"][window],
+                        )
+                        for window in windows
+                    ),
+                    over_seeds(
+                        [entry["tolerance_gap_steps"] for entry in entries],
+                        1,
+                        entries[0]["tolerance_gap_ci95"],
+                    ),
+                ]
+            )
+    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    path.with_suffix(".md").write_text(f"{text}\n\n{compared(measured)}")
+
+
+def windows_of(measured: dict[str, dict[int, dict[str, Any]]]) -> list[str]:
+    """Names of the windows that the NMAE is averaged over."""
+    first = next(iter(next(iter(measured.values())).values()))
+    return list(next(iter(first["methods"].values()))["nmae_windows"])
+
+
+def compared(measured: dict[str, dict[int, dict[str, Any]]]) -> str:
+    """Within each row, its first method against the others, paired over seeds."""
+    lines = []
+    for name, by_seed in measured.items():
+        if len(by_seed) < 2:
+            continue
+        first, *others = next(iter(by_seed.values()))["methods"]
+        results = [result["methods"] for result in by_seed.values()]
+        for other in others:
+            gains = [
+                entry[first]["tolerance_gap_steps"] / entry[other]["tolerance_gap_steps"] - 1
+                for entry in results
+            ]
+            parts = [f"D* {over_seeds([100 * gain for gain in gains], 1)} %"]
+            for window in windows_of(measured):
+                differences = [
+                    entry[first]["nmae_windows"][window] - entry[other]["nmae_windows"][window]
+                    for entry in results
+                ]
+                parts.append(f"NMAE {window} {over_seeds(differences, 5)}")
+            lines.append(f"- {name}: {first} over {other}, n = {len(gains)}: {'; '.join(parts)}")
+    return "\n".join(lines) + "\n" * bool(lines)
+
+
+def over_seeds(values: list[float], decimals: int, alone: list[float] | None = None) -> str:
+    """Mean and Student's 95 % interval over seeds; of one seed the value and ``alone``."""
+    if not values:
+        return "–"
+    mean, n = float(np.mean(values)), len(values)
+    interval = alone
+    if n > 1:
+        half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
+        interval = [mean - half, mean + half]
+    text = f"{mean:.{decimals}f}"
+    if interval is not None:
+        text += f" ({interval[0]:.{decimals}f} – {interval[1]:.{decimals}f})"
+    return text
+
+
+if __name__ == "__main__":
+    main()
