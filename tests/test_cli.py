@@ -429,7 +429,8 @@ import sys, time, types
 module = types.ModuleType("hjepa_cli.stages.collect")
 def run(settings, screen, **options):
     screen.say("ready")
-    time.sleep(30)
+    for _ in range(3000):  # one long sleep could begin just after the signal, and sleep on
+        time.sleep(0.01)
 module.run = run
 sys.modules[module.__name__] = module
 from hjepa_cli.cli import main
