@@ -87,7 +87,9 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
             *("train-encoder", *common, "--no-gate", "--dataset", data, "--out", encoder)
         )
         h, m, l = row.get("strides", (None, None, None))
-        strides = [f"--{name}={value}" for name, value in zip("hml", (h, m, l), strict=True) if value]
+        strides = [
+            f"--{name}={value}" for name, value in zip("hml", (h, m, l), strict=True) if value
+        ]
         checkpoint = directory("train-hierarchy", row.get("strides"))
         hjepa(
             *("train-hierarchy", *common, *strides),
@@ -115,7 +117,8 @@ def hjepa(*words: object) -> dict[str, Any]:
 def as_toml(sections: dict[str, dict[str, Any]]) -> str:
     """Sections of plain values as TOML; JSON writes those alike."""
     return "".join(
-        f"[{section}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
+        f"[{section}]\n"
+        + "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
         for section, values in sections.items()
     )
 

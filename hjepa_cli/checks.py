@@ -34,6 +34,12 @@ METHODS = (
     "local",
 )
 
+# The paper's Fig. 3, and the ceiling of prediction.
+COMPARED = (
+    *("hjepa", "ts-jepa-1", "ts-jepa-2", "ts-jepa-3", "ts-jepa-4", "ts-jepa-5"),
+    *("supervised-2", "supervised-4", "autoencoder-2", "hold", "zero", "optimal", "oracle"),
+)
+
 # Those that send the true state: they render and encode nothing.
 TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
 

@@ -17,6 +17,7 @@ import typer
 from typer.main import get_command
 
 from hjepa_cli import __version__, options, plan, torchrun
+from hjepa_cli.checks import COMPARED
 from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, resolve
 from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
 from hjepa_cli.screen import Screen, one_line
@@ -290,6 +291,7 @@ def evaluate(
     plant_spread: options.PlantSpread = None,
     payload: options.Payload = None,
     remeasure: options.Remeasure = False,
+    figure: options.Figure = False,
     checkpoint: options.Checkpoint = None,
     dataset: options.CleanDataset = None,
     out: options.Out = None,
@@ -313,7 +315,7 @@ def evaluate(
             "plant": plant,
             "seed": seed,
             "device": device,
-            "methods": options.split_names(methods),
+            "methods": options.split_names(methods) or (COMPARED if figure else None),
             "protocol.process_noise": process_noise,
             "protocol.plant_spread": plant_spread,
             "protocol.payload": payload,
@@ -331,6 +333,7 @@ def evaluate(
             dataset=dataset,
             out=out,
             remeasure=remeasure,
+            figure=figure,
         )
 
     execute(

@@ -126,8 +126,10 @@ def _pair(figure: SubFigure) -> tuple[Axes, Axes]:
 def _points(
     axes: Axes, entries: Entries, methods: Sequence[str], value: str, interval: str
 ) -> None:
-    """One mark with its 95 % interval per method, side by side."""
+    """One mark with its 95 % interval per method that has the value, side by side."""
     for place, (name, entry) in enumerate(entries.items()):
+        if value not in entry:
+            continue  # measured by a version that did not take it
         style = method_style(name, list(methods))
         low, high = entry[interval]
         axes.errorbar(

@@ -333,7 +333,9 @@ def error_figure(
             if errors.max() < ZERO_ERROR:
                 continue  # oracle and optimal know the noise-free future but for rounding
             band = np.array(entry["nmae_ci95"], float)
-            draw_line(axes, method, list(entries), 1e3 * step_s * np.arange(len(errors)), errors, band)
+            draw_line(
+                axes, method, list(entries), 1e3 * step_s * np.arange(len(errors)), errors, band
+            )
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())

@@ -352,6 +352,14 @@ Payload = Annotated[
 Remeasure = Annotated[
     bool, _plain(LOOP, "--remeasure", "Measure the closed-loop curves again, cached or not.")
 ]
+Figure = Annotated[
+    bool,
+    _plain(
+        LOOP,
+        "--figure",
+        "Draw the paper's Fig. 3: error, bits and score of all its methods, or of --methods.",
+    ),
+]
 Verify = Annotated[
     bool,
     _plain(

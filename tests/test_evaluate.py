@@ -21,7 +21,7 @@ import torch
 from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core import executors
 from hjepa_cli.core import workers as workers_module
-from hjepa_cli.core.bench import Bench, control_entry, control_errors
+from hjepa_cli.core.bench import Bench, control_entry, control_errors, errors_at_every_step
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.loop import Outcome
@@ -650,6 +650,19 @@ def test_control_errors_follow_their_definition() -> None:
         assert dropped[:, j] == pytest.approx(np.abs(truth * (j > 0)) / 40, abs=1e-6)
 
 
+def test_errors_at_every_step_are_those_of_the_last_packet() -> None:
+    states, teacher_n = rollouts(40)
+    method = true_state_method("hold-true", DESKTOP, 0)
+    truth = teacher("desktop")(states[:, 1:32])
+    on_time = errors_at_every_step(method, states, teacher_n, 20.0, 30)
+    assert on_time == pytest.approx(np.abs(truth - teacher_n[:, :31]) / 40, abs=1e-9)
+    late = dataclasses.replace(method, delay_steps=3)
+    errors = errors_at_every_step(late, states, teacher_n, 20.0, 30)
+    assert errors[:, :3] == pytest.approx(np.abs(teacher_n[:, :3]) / 40, abs=1e-9)
+    expected = np.abs(truth[:, :-3] - teacher_n[:, 3:31]) / 40
+    assert errors[:, 3:] == pytest.approx(expected, abs=1e-9) and errors[:, 3:].max() > 1e-3
+
+
 def test_oracle_and_optimal_make_no_error_on_clean_rollouts() -> None:
     states, teacher_n = rollouts(120)
     for name, limit in (("optimal", 1e-6), ("oracle", 2e-3)):
@@ -657,7 +670,9 @@ def test_oracle_and_optimal_make_no_error_on_clean_rollouts() -> None:
         assert control_errors(method, states, teacher_n, 20.0, 100).max() < limit
     hold = true_state_method("hold-true", DESKTOP, 0)
     errors = control_errors(hold, states, teacher_n, 20.0, 100)
-    entry = control_entry(errors, 100, seed=0)
+    entry = control_entry(errors, errors + 1, 100, seed=0)
+    assert entry["nmae_every_step"] == pytest.approx(np.mean(entry["nmae"]) + 1)
+    assert entry["nmae_every_step_ci95"][0] < entry["nmae_every_step"]
     assert entry["nmae"][0] < 1e-6 < entry["nmae_windows"]["21-40"]
     assert entry["nmae_windows"]["1-20"] == pytest.approx(np.mean(entry["nmae"][1:21]))
     low, high = entry["nmae_windows_ci95"]["81-100"]

@@ -182,30 +182,49 @@ def control_errors(
     Returns:
         |ũ - u*| ÷ force range [R, horizon + 1], the mean over a device's forces.
     """
-    rollouts = len(states)
-    controller = method.controller(rollouts)
-    if method.uses_link:
-        packets = method.sensor(last_states(states, 0))
-        delay_steps = method.delay_steps
-        forces_n = play(controller, packets, rollouts, horizon + 1, delay_steps=delay_steps)
-    else:
-        all_of_them = np.ones(rollouts, dtype=bool)
-        forces_n = np.stack(
-            [
-                controller.act(all_of_them, method.sensor(last_states(states, j)))
-                for j in range(horizon + 1)
-            ],
-            axis=1,
-        )
+    if not method.uses_link:
+        return errors_at_every_step(method, states, teacher_n, force_limit_n, horizon)
+    packets, delay_steps = method.sensor(last_states(states, 0)), method.delay_steps
+    controller = method.controller(len(states))
+    forces_n = play(controller, packets, len(states), horizon + 1, delay_steps=delay_steps)
+    return _errors(forces_n, teacher_n, force_limit_n)
+
+
+def errors_at_every_step(
+    method: Method, states: Floats, teacher_n: Floats, force_limit_n: float, horizon: int
+) -> Floats:
+    """Control error without prediction, with a packet at every step of given rollouts.
+
+    Arguments and result as of :func:`control_errors`.
+    """
+    controller, every = method.reactive(len(states)), np.ones(len(states), dtype=bool)
+    forces_n = []
+    for j in range(horizon + 1):
+        sent = j - method.delay_steps
+        packets = method.sensor(last_states(states, sent)) if sent >= 0 else None
+        forces_n.append(controller.act(every if sent >= 0 else ~every, packets))
+    return _errors(np.stack(forces_n, axis=1), teacher_n, force_limit_n)
+
+
+def _errors(forces_n: Floats, teacher_n: Floats, force_limit_n: float) -> Floats:
+    """Forces as played and the teacher's [R, ≥ steps, *A] → errors [R, steps]."""
+    rollouts, steps = forces_n.shape[:2]
     forces_n = np.clip(forces_n, -force_limit_n, force_limit_n)
-    errors = metrics.control_error(forces_n, teacher_n[:, : horizon + 1], force_limit_n)
-    return np.asarray(errors.reshape(rollouts, horizon + 1, -1).mean(axis=-1))
+    errors = metrics.control_error(forces_n, teacher_n[:, :steps], force_limit_n)
+    return np.asarray(errors.reshape(rollouts, steps, -1).mean(axis=-1))
 
 
-def control_entry(errors: Floats, replicates: int, seed: int) -> dict[str, Any]:
-    """What ``eval --json`` prints about a method's control error [R, horizon + 1]."""
+def control_entry(errors: Floats, every_step: Floats, replicates: int, seed: int) -> dict[str, Any]:
+    """What ``eval --json`` prints about a method's control errors [R, horizon + 1].
+
+    Args:
+        errors: after the only packet.
+        every_step: with a packet at every step.
+        replicates, seed: of the bootstrap over rollouts.
+    """
     weights = metrics.bootstrap_weights(len(errors), replicates, seed)
     windows = metrics.window_means(errors)
+    at_once = every_step.mean(axis=1)
     return {
         "nmae": errors.mean(axis=0).tolist(),
         "nmae_ci95": metrics.mean_interval(errors, weights).T.tolist(),
@@ -214,6 +233,8 @@ def control_entry(errors: Floats, replicates: int, seed: int) -> dict[str, Any]:
             name: metrics.mean_interval(values, weights).tolist()
             for name, values in windows.items()
         },
+        "nmae_every_step": float(at_once.mean()),
+        "nmae_every_step_ci95": metrics.mean_interval(at_once, weights).tolist(),
         "n_rollouts": len(errors),
     }
 

@@ -7,11 +7,12 @@ all they depend on, and tables. ``scale`` takes the same curves through :func:`c
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from hjepa_cli.checks import check_methods, split_late
-from hjepa_cli.core.bench import Bench, control_entry, control_errors
+from hjepa_cli.core.bench import Bench, control_entry, control_errors, errors_at_every_step
 from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import WINDOWS
@@ -21,7 +22,7 @@ from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.core.workers import cluster_runner, open_workers, single_thread
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
@@ -44,6 +45,7 @@ def run(
     out: Path | None = None,
     remeasure: bool = False,
     further: Sequence[Path] | None = None,
+    figure: bool = False,
 ) -> dict[str, Any]:
     """Evaluate ``settings.methods``; returns the document of ``--json``.
 
@@ -56,13 +58,18 @@ def run(
         out: run directory; an interrupted one is continued after the last finished method.
         remeasure: do not use cached curves.
         further: models of methods that the first one does not hold; ``None`` looks for them.
+        figure: draw the paper's Fig. 3 into the run's directory.
 
     Raises:
         UsageError: unknown method.
-        MissingInputError: no such checkpoint or dataset.
+        MissingInputError: no such checkpoint or dataset, or no matplotlib for ``figure``.
         DataError: a damaged file, or one of another plant.
     """
     check_methods(settings.methods)
+    if figure and find_spec("matplotlib") is None:
+        raise MissingInputError(
+            "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
+        )
     subject = open_subject(settings, screen, checkpoint, dataset, further)
     inputs = subject.inputs(remeasure=remeasure)
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
@@ -72,7 +79,25 @@ def run(
         else:
             screen.say(f"{record.directory} is finished; this is its result")
         show(result, screen)
+        if figure:
+            result["figures"] = draw(result, settings, record.directory, screen)
         return result
+
+
+def draw(result: dict[str, Any], settings: Settings, directory: Path, screen: Screen) -> list[Path]:
+    """Write the paper's Fig. 3 as ``comparison.png``, ``.svg`` and ``.pdf``."""
+    from hjepa_cli.comparison import comparison_figure
+    from hjepa_cli.figures import save
+
+    drawn = comparison_figure(
+        result["methods"],
+        acceptable_score=result["acceptable_score"],
+        step_s=plant(settings.plant).step_s,
+        title=f"{result['plant']}, seed {result['seed']}, 95 % CI",
+    )
+    paths = [save(drawn, directory / f"comparison.{kind}") for kind in ("png", "svg", "pdf")]
+    screen.say(f"written: {', '.join(map(str, paths))}")
+    return paths
 
 
 def curves_for(
@@ -258,11 +283,14 @@ def _measure(
             method = build_method(name, settings, subject.model)
             with _ticking(screen, f"eval {name}", _usual_device_steps(settings)) as tick:
                 bench.tick = tick
-                errors = control_errors(method, states, teacher_n, limit_n, protocol.horizon)
+                errors, every_step = (
+                    measure(method, states, teacher_n, limit_n, protocol.horizon)
+                    for measure in (control_errors, errors_at_every_step)
+                )
                 yield (
                     name,
                     {
-                        **control_entry(errors, protocol.bootstrap, settings.seed),
+                        **control_entry(errors, every_step, protocol.bootstrap, settings.seed),
                         **bench.entry(method),
                         "teacher_score": bench.teacher_score,
                         "seed": settings.seed,
