@@ -7,11 +7,11 @@ A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and r
 the settings in which it differs from the preset. A row without settings of the training stages and
 with a ``checkpoint`` only measures that one.
 
-Everything is kept below ``--out`` in directories named after what they depend on, so rows share what
-they can (one dataset, one encoder), an interrupted study goes on with the same command, and a study
-with more seeds or rows only adds to it. The table goes to the screen and to ``OUT/STUDY.md``, all
-numbers to ``OUT/STUDY.json``. With several seeds the intervals are Student's over seeds; with one,
-the bootstrap's over devices or rollouts, and they say nothing about another training.
+Everything is kept below ``--out`` in directories named after what they depend on, so rows share
+what they can (one dataset, one encoder), an interrupted study goes on with the same command, and a
+study with more seeds or rows only adds to it. The table goes to the screen and to ``OUT/STUDY.md``,
+all numbers to ``OUT/STUDY.json``. With several seeds the intervals are Student's over seeds; with
+one, the bootstrap's over devices or rollouts, and they say nothing about another training.
 """
 
 import argparse
@@ -81,7 +81,8 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
     if "checkpoint" in row:
         checkpoint, health = row["checkpoint"], {}
     else:
-        data, encoder, checkpoint = map(directory, SECTIONS_OF)
+        data, encoder = directory("collect"), directory("train-encoder")
+        checkpoint = directory("train-hierarchy", row.get("strides"))
         hjepa("collect", *common, "--out", data)
         trained = hjepa(
             *("train-encoder", *common, "--no-gate", "--dataset", data, "--out", encoder)

@@ -77,6 +77,8 @@ class EncoderSettings:
     gradient_clip: float
     ema_decay: float
     inverse_dynamics: float
+    regulariser: Literal["none", "vicreg", "sigreg"]
+    regulariser_weight: float
     mirror: Literal["exact", "augment", "none"]
     shift_px: int
     precision: Literal["auto", "bf16", "fp32"]

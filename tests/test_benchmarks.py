@@ -5,10 +5,16 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+from scipy import stats
+
+from hjepa_cli.checks import METHODS, check_settings
+from hjepa_cli.settings import load_settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted((REPOSITORY / "benchmarks").glob("*.py"))
@@ -76,3 +82,76 @@ def test_the_training_step_is_measured_against_its_promises() -> None:
     assert "plain" in slow and "4.99" in slow
     (slow,) = shortfalls({"bare": 0.89, "plain": 12.0})
     assert "bare" in slow
+
+
+STUDIES = sorted((REPOSITORY / "benchmarks" / "studies").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_every_row_of_a_study_is_a_recipe_with_a_name_of_its_own(
+    path: Path, tmp_path: Path
+) -> None:
+    study, as_toml = tomllib.loads(path.read_text()), load("study").as_toml
+    assert set(study) == {"methods", "row"} and set(study["methods"]) <= set(METHODS)
+    names = [row["name"] for row in study["row"]]
+    assert len(set(names)) == len(names)
+    recipes = []
+    for row in study["row"]:
+        sections = {key: value for key, value in row.items() if isinstance(value, dict)}
+        config = tmp_path / "config.toml"
+        config.write_text(as_toml(sections))
+        assert tomllib.loads(config.read_text()) == sections
+        settings = load_settings(row.get("preset"), config)
+        check_settings(settings)
+        for section, values in sections.items():
+            for key, value in values.items():
+                assert getattr(getattr(settings, section), key) == value
+        recipes.append((settings, *row.get("strides", ())))
+    assert len(set(recipes)) == len(recipes)
+
+
+def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    study, ran = load("study"), []
+
+    def pretended(*words: object) -> dict[str, object]:
+        ran.append([str(word) for word in words])
+        return {"health": {}, "methods": {}}
+
+    monkeypatch.setattr(study, "hjepa", pretended)
+    rows = [
+        {"name": "plain"},
+        {"name": "long", "encoder": {"steps": 7}},
+        {"name": "other strides", "strides": [16, 4, 1]},
+        {"name": "fixed", "checkpoint": "desktop-h4m2l1", "protocol": {"plant_spread": 0.2}},
+    ]
+    for row in rows:
+        study.measure(row, 3, ["hjepa"], tmp_path)
+
+    def used(stage: str, flag: str) -> list[str]:
+        return [words[words.index(flag) + 1] for words in ran if words[0] == stage]
+
+    assert len(set(used("collect", "--out"))) == 1
+    assert used("train-encoder", "--out")[0] == used("train-encoder", "--out")[2]
+    assert len(set(used("train-encoder", "--out"))) == 2
+    assert used("train-hierarchy", "--encoder") == used("train-encoder", "--out")
+    assert len(set(used("train-hierarchy", "--out"))) == 3
+    assert ["--h=16" in words for words in ran if words[0] == "train-hierarchy"] == [
+        False,
+        False,
+        True,
+    ]
+    assert used("eval", "--checkpoint")[:3] == used("train-hierarchy", "--out")
+    assert used("eval", "--checkpoint")[3] == "desktop-h4m2l1"
+    assert len(set(used("eval", "--out"))) == 4
+    assert {words[words.index("--seed") + 1] for words in ran} == {"3"}
+
+
+def test_intervals_of_a_study_are_students_over_seeds() -> None:
+    over_seeds = load("study").over_seeds
+    values = [170.0, 174.0, 181.0]
+    low, high = stats.t.interval(0.95, 2, np.mean(values), stats.sem(values))
+    assert over_seeds(values, 1) == f"175.0 ({low:.1f} – {high:.1f})"
+    assert over_seeds([3.0], 2, [1.0, 4.0]) == "3.00 (1.00 – 4.00)"
+    assert over_seeds([], 2) == "–"

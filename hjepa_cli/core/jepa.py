@@ -11,6 +11,7 @@ from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.hierarchy import rollout_loss
 from hjepa_cli.core.losses import InverseDynamics
 from hjepa_cli.core.predictors import Predictor
+from hjepa_cli.core.regularisers import REGULARISERS
 
 
 class Jepa:
@@ -21,6 +22,8 @@ class Jepa:
         predictor: companion P^H, one stride per call.
         ema_decay: η.
         inverse_dynamics: weight of the inverse-dynamics loss; 0 leaves it out.
+        regulariser: ``"none"``, or one of :data:`~hjepa_cli.core.regularisers.REGULARISERS`.
+        regulariser_weight: of its term.
         rollout_strides: length of the training rollouts in strides.
         forces: how many drive a device.
         mirror: as for :class:`Predictor`, of the auxiliary task.
@@ -37,6 +40,8 @@ class Jepa:
         device: torch.device,
         forces: int = 1,
         mirror: Sequence[float] | None = None,
+        regulariser: str = "none",
+        regulariser_weight: float = 0.0,
     ) -> None:
         self.encoder, self.predictor = encoder.to(device), predictor.to(device)
         self.target = EmaTarget(encoder, ema_decay)
@@ -47,6 +52,9 @@ class Jepa:
             self.weights["inverse_dynamics"] = inverse_dynamics
             self.inverse = InverseDynamics(encoder.embedding, forces=forces, mirror=mirror)
             self.inverse.to(device)
+        self.regulariser = regulariser
+        if regulariser != "none":
+            self.weights[regulariser] = regulariser_weight
         self.device = device
 
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
@@ -70,6 +78,8 @@ class Jepa:
             terms["inverse_dynamics"] = self.inverse.loss(
                 z[:, :-1].flatten(0, 1), z[:, 1:].flatten(0, 1), actions.mean(2).flatten(0, 1)
             )
+        if self.regulariser != "none":
+            terms[self.regulariser] = REGULARISERS[self.regulariser](z.flatten(0, 1))
         return terms
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:

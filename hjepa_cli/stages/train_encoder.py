@@ -146,6 +146,12 @@ def train_jepa(modules: nn.ModuleDict, training: Training) -> dict[str, Any]:
     assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
     encoder.fit_standardisation(standardisation_sample(training.train.frames))
     if ranks.size > 1:
+        if options.regulariser != "none":
+            raise UsageError(
+                f"encoder.regulariser = {options.regulariser!r} looks at a whole batch, and "
+                f"{ranks.size} processes share one",
+                hint="train with it in one process, without torchrun",
+            )
         share_statistics(encoder)
     jepa = Jepa(
         encoder,
@@ -156,6 +162,8 @@ def train_jepa(modules: nn.ModuleDict, training: Training) -> dict[str, Any]:
         device=resolve_device(settings.device),
         forces=math.prod(kind.action_shape),
         mirror=kind.force_signs if options.mirror == "exact" else None,
+        regulariser=options.regulariser,
+        regulariser_weight=options.regulariser_weight,
     )
 
     def look(terms: dict[str, float]) -> dict[str, Any]:
