@@ -68,7 +68,10 @@ LARGEST_STRIDE = 10_000
 # Counts that may be 0; all others start at 1.
 ZERO_ALLOWED = ("seed", "encoder.shift_px", "radio.overhead_bits")
 NEGATIVE_ALLOWED = ("encoder.gate_", "radio.power_dbm")  # thresholds of R²; decibels
-POSITIVE = ("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket")
+POSITIVE = (
+    *("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket"),
+    *("conditions.light", "conditions.pole_length"),
+)
 BELOW_ONE = ("actor.dropout", "encoder.ema_decay", "protocol.plant_spread", "protocol.bracket")
 
 

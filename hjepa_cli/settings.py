@@ -177,6 +177,15 @@ class ProtocolSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class ConditionSettings:
+    """``eval`` and ``scale``: how devices differ from those that models were trained on."""
+
+    light: float
+    camera_noise: float
+    pole_length: float
+
+
+@dataclasses.dataclass(frozen=True)
 class RadioSettings:
     """``scale``: the radio cell."""
 
@@ -212,6 +221,7 @@ class Settings:
     actor: ActorSettings
     hierarchy: HierarchySettings
     protocol: ProtocolSettings
+    conditions: ConditionSettings
     radio: RadioSettings
 
     def as_dict(self) -> dict[str, Any]:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
-from hjepa_cli import figures  # noqa: E402 - needs matplotlib
-from hjepa_cli.checks import COMPARED, METHODS  # noqa: E402
-from hjepa_cli.comparison import WIDTH_IN, comparison_figure  # noqa: E402
-from hjepa_cli.storage.zoo import zoo_directory  # noqa: E402
+from hjepa_cli import figures
+from hjepa_cli.checks import COMPARED, METHODS
+from hjepa_cli.comparison import WIDTH_IN, comparison_figure
+from hjepa_cli.storage.zoo import zoo_directory
 
 
 def entries(methods=("hjepa", "ts-jepa-1", "supervised-2", "optimal", "oracle")):
@@ -48,8 +48,8 @@ def test_every_method_is_named_once_and_drawn_where_it_was_measured():
     given = entries()
     figure = drawn(given)
     [legend] = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["hjepa", "ts-jepa-1",
-                                                                "supervised-2", "oracle"]  # fmt: skip
+    named = [text.get_text() for text in legend.get_texts()]
+    assert named == ["hjepa", "ts-jepa-1", "supervised-2", "oracle"]
     _, later, bits, _, score = panels(figure)
     errors = {line.get_label(): line for line in later.lines}
     assert "optimal" not in errors  # makes none

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hjepa_cli.checks import RAW_FRAMES, TRUE_STATE, late, split_late
 from hjepa_cli.core.codecs import Codec, bits_of, build_codec
+from hjepa_cli.core.conditions import actual_camera
 from hjepa_cli.core.controllers import LastForce, Oracle, Planner, StrideController
 from hjepa_cli.core.disagreement import TwoLevels
 from hjepa_cli.core.encoder import CHANNELS, HEIGHT_PX, WIDTH_PX
@@ -25,7 +26,7 @@ from hjepa_cli.core.linear_latent import LinearPlanner, fit_linear_latent
 from hjepa_cli.core.loop import Controller, Sensor
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.sensors import camera_sensor, embedding_sensor, true_state
-from hjepa_cli.core.system import System
+from hjepa_cli.core.system import Camera, System
 from hjepa_cli.errors import UsageError
 from hjepa_cli.settings import Settings
 
@@ -80,18 +81,19 @@ def _build_method(name: str, settings: Settings, model: "Model | None") -> Metho
         return true_state_method(name, plant(settings.plant), sent)
     if model is None or name not in model.methods:
         raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")
+    camera = actual_camera(settings)
     if name in RAW_FRAMES:
-        return frames_method(name, model)
+        return frames_method(name, model, camera)
     if name == "local":
-        return local_method(model)
+        return local_method(model, camera)
     if name in ("state-kf", "state-48"):
         return filtered_method(name, model, settings)
     codec = build_codec(payload, model, settings)
     if name == "linear":
         latent = fit_linear_latent(model, settings)
         planner = LinearPlanner(latent, model.actor, model.force_limit_n)
-        return embedding_method(name, model, codec, planner)
-    return embedding_method(name, model, codec)
+        return embedding_method(name, model, codec, planner, camera)
+    return embedding_method(name, model, codec, camera=camera)
 
 
 def true_state_method(name: str, kind: System, bits_per_transmission: int) -> Method:
@@ -117,9 +119,20 @@ def true_state_method(name: str, kind: System, bits_per_transmission: int) -> Me
 
 
 def embedding_method(
-    name: str, model: "Model", codec: Codec, planner: Planner | None = None
+    name: str,
+    model: "Model",
+    codec: Codec,
+    planner: Planner | None = None,
+    camera: Camera | None = None,
 ) -> Method:
-    """A method that lives on a trained model's embeddings, with a planner of its own if given one.
+    """A method that lives on a trained model's embeddings.
+
+    Args:
+        name: the method.
+        model: encoder, actor and, unless given, planner.
+        codec: what embeddings are sent through.
+        planner: one that is not the model's.
+        camera: as for :func:`~hjepa_cli.core.sensors.camera_sensor`.
 
     Raises:
         UsageError: the model does not hold this method.
@@ -132,24 +145,25 @@ def embedding_method(
     elif name != "hold":
         planner, shape = planner or model.planner(name), model.action_shape
         build = functools.partial(StrideController, planner, action_shape=shape)
-    sensor = embedding_sensor(model, codec)
+    sensor = embedding_sensor(model, codec, camera)
     two_levels = functools.partial(_two_levels, model) if name == "hjepa" else None
     return Method(name, sensor, build, reactive, codec.bits, "embedding", two_levels=two_levels)
 
 
-def frames_method(name: str, model: "Model") -> Method:
+def frames_method(name: str, model: "Model", camera: Camera | None = None) -> Method:
     """A baseline whose controller receives camera frames, acts on them and holds the force."""
 
     def act(frames: NDArray[np.uint8]) -> Tensor:
         return model.actor(model.encode(frames).to(model.device))
 
     build = functools.partial(LastForce, act, keep=True, action_shape=model.action_shape)
-    return Method(name, camera_sensor(model), build, build, model.frames * FRAME_BITS, name)
+    look, bits = camera_sensor(model, camera), model.frames * FRAME_BITS
+    return Method(name, look, build, build, bits, name)
 
 
-def local_method(model: "Model") -> Method:
+def local_method(model: "Model", camera: Camera | None = None) -> Method:
     """The actor on the device, at every step on what the camera shows: nothing is sent."""
-    shape, sensor = model.action_shape, embedding_sensor(model, None)
+    shape, sensor = model.action_shape, embedding_sensor(model, None, camera)
     build = functools.partial(LastForce, model.actor, keep=True, action_shape=shape)
     return Method("local", sensor, build, build, 0, "local", uses_link=False)
 
@@ -161,8 +175,9 @@ def filtered_method(name: str, model: "Model", settings: Settings) -> Method:
     if name == "state-kf":
         codec = build_codec(settings.protocol.payload, model, settings)
         build = functools.partial(KalmanController, reader.filter, reader.read, *controls)
-        return Method(name, embedding_sensor(model, codec), build, build, codec.bits, name)
-    fresh = embedding_sensor(model, None)
+        received = embedding_sensor(model, codec, actual_camera(settings))
+        return Method(name, received, build, build, codec.bits, name)
+    fresh = embedding_sensor(model, None, actual_camera(settings))
     build = functools.partial(KalmanController, reader.quantised, np.asarray, *controls)
     sensor: Sensor = lambda seen: reader.codec.send(reader.read(fresh(seen)))  # noqa: E731
     return Method(name, sensor, build, build, reader.codec.bits, name)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hjepa_cli.core.codecs import Codec
 from hjepa_cli.core.plant import plant
-from hjepa_cli.core.system import Floats
+from hjepa_cli.core.system import Camera, Floats
 
 if TYPE_CHECKING:
     from hjepa_cli.core.model import Model
@@ -23,9 +23,16 @@ def true_state(seen: Floats) -> Floats:
     return seen[:, -1]
 
 
-def camera_sensor(model: "Model") -> Callable[[Floats], NDArray[np.uint8]]:
-    """The last κ frames, as many as the model's network looks at."""
-    camera = plant(model.plant_name).camera()
+def camera_sensor(
+    model: "Model", camera: Camera | None = None
+) -> Callable[[Floats], NDArray[np.uint8]]:
+    """The last κ frames, as many as the model's network looks at.
+
+    Args:
+        model: whose network that is.
+        camera: what takes them; the one that the model was trained with by default.
+    """
+    camera = camera or plant(model.plant_name).camera()
 
     def look(seen: Floats) -> NDArray[np.uint8]:
         """The last states [m, 4, S] → frames uint8 [m, κ, 64, 128, 3]."""
@@ -39,9 +46,11 @@ def camera_sensor(model: "Model") -> Callable[[Floats], NDArray[np.uint8]]:
     return look
 
 
-def embedding_sensor(model: "Model", codec: Codec | None) -> Callable[[Floats], Tensor]:
+def embedding_sensor(
+    model: "Model", codec: Codec | None, camera: Camera | None = None
+) -> Callable[[Floats], Tensor]:
     """Embeddings of the last frames, through the codec; without one, as the device has them."""
-    look = camera_sensor(model)
+    look = camera_sensor(model, camera)
 
     def sense(seen: Floats) -> Tensor:
         """The last states [m, 4, S] → received embeddings [m, D]."""

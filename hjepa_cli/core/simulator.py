@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from hjepa_cli.core.conditions import actual_plant
 from hjepa_cli.core.loop import Draws, Outcome, simulate
 from hjepa_cli.core.methods import Method, build_method
 from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.settings import Settings
 
@@ -56,7 +56,7 @@ class Simulator:
         protocol = settings.protocol
         devices = max(protocol.curve_devices, protocol.bracket_devices)
         self._settings, self._model = settings, model
-        self._plant = plant(settings.plant)
+        self._plant = actual_plant(settings)
         self._draws = Draws.make(protocol, devices, settings.seed)
         self._methods: dict[str, Method] = {}
 

@@ -11,12 +11,12 @@ from hjepa_cli.core.cell import Row
 from hjepa_cli.core.cell_loop import measure_growth, measure_levels, simulate_cell
 from hjepa_cli.core.channel import thermal_noise_dbm
 from hjepa_cli.core.coding import packet_uses
+from hjepa_cli.core.conditions import actual_plant
 from hjepa_cli.core.disagreement import Levels
 from hjepa_cli.core.growth import Growth
 from hjepa_cli.core.hall import drop_devices, power_margin_db
 from hjepa_cli.core.loop import Draws, Floats, every_step, simulate
 from hjepa_cli.core.methods import Method, build_method
-from hjepa_cli.core.plant import plant
 from hjepa_cli.core.scheduled import (
     BLOCK_DEVICES,
     MAX_BISECTIONS,
@@ -47,7 +47,7 @@ class ScheduledCell:
     def __init__(self, subject: Subject, screen: Screen) -> None:
         self._subject, self._screen = subject, screen
         self._settings = subject.settings
-        self._plant = plant(subject.settings.plant)
+        self._plant = actual_plant(subject.settings)
         self._methods: dict[str, Method] = {}
         self._growth: dict[tuple[str, int], Growth] = {}
         self._levels: dict[tuple[str, int], Levels] = {}

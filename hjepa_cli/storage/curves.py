@@ -25,6 +25,8 @@ Entry = dict[str, Any]
 
 Check = Callable[[Any], bool]
 
+NOMINAL = {"light": 1.0, "camera_noise": 0.0, "pole_length": 1.0}
+
 LARGEST = 1e12  # beyond anything that is measured; keeps arithmetic in range
 _CLEAN = (
     "clean_trajectories",
@@ -76,6 +78,11 @@ class Digest:
             "embedding": values["encoder"]["embedding"],
             "clean": [source["seed"], *(collected[key] for key in _CLEAN), *start],
         }
+        changed = {
+            key: value for key, value in values["conditions"].items() if value != NOMINAL[key]
+        }
+        if changed:  # or digests would not be those of before there were conditions
+            measured["conditions"] = changed
         text = files.canonical_json(measured)
         return cls(checkpoint, hashlib.sha256(text.encode()).hexdigest())
 

@@ -1,0 +1,96 @@
+"""Devices that differ from those of the training data."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hjepa_cli.core.conditions import Disturbed, actual_camera, actual_plant
+from hjepa_cli.core.plant import plant
+from hjepa_cli.core.protocol import Point
+from hjepa_cli.core.simulator import Block, Simulator
+from hjepa_cli.errors import UsageError
+from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.storage.curves import Digest
+from hjepa_cli.storage.zoo import zoo_directory
+
+STATES = np.array([[0.01, 0.2, 0.1, -0.3], [-0.02, 0.0, -0.2, 1.0]])
+
+
+def settings(preset: str = "default", seed: int = 0, **conditions: float) -> Settings:
+    changes = {f"conditions.{name}": value for name, value in conditions.items()}
+    return load_settings(preset, flags={"seed": seed, **changes})
+
+
+def test_nominal_conditions_change_nothing() -> None:
+    assert actual_plant(settings()) is plant("desktop")
+    assert not isinstance(actual_camera(settings()), Disturbed)
+
+
+def test_light_scales_what_the_camera_sees() -> None:
+    nominal = plant("desktop").camera().render(STATES).astype(float)
+    for light in (0.5, 1.3):
+        seen = actual_camera(settings(light=light)).render(STATES)
+        assert np.abs(seen - np.clip(light * nominal, 0, 255)).max() <= 0.501
+
+
+def test_noise_is_as_wide_as_it_says_and_the_same_for_the_same_states() -> None:
+    camera = actual_camera(settings(light=0.5, camera_noise=4.0))
+    nominal = 0.5 * plant("desktop").camera().render(STATES).astype(float)
+    seen = camera.render(STATES)
+    errors = (seen - nominal)[nominal > 30]
+    # Rounding adds 1/12; a standard deviation from n values is good to σ / √(2n).
+    width = np.sqrt(4.0**2 + 1 / 12)
+    assert abs(errors.std() - width) < 4 * width / np.sqrt(2 * errors.size)
+    assert abs(errors.mean()) < 4 * width / np.sqrt(errors.size)
+    assert (actual_camera(settings(light=0.5, camera_noise=4.0)).render(STATES) == seen).all()
+    assert (camera.render(STATES + 1e-9) != seen).any()
+    other = actual_camera(settings(seed=1, light=0.5, camera_noise=4.0))
+    assert (other.render(STATES) != seen).any()
+
+
+def test_longer_poles_fall_slower_and_look_longer() -> None:
+    longer, lean = actual_plant(settings(pole_length=1.2)), 1e-4
+    for kind in (plant("desktop"), longer):
+        rate = kind.unstable_rate_rad_s
+        simulation = kind.simulation(1)
+        # The growing mode of the linearised pole without force: θ̇ = λ θ.
+        simulation.states = np.array([[0.0, 0.0, lean, rate * lean]])
+        for _ in range(50):
+            simulation.step(np.zeros(1))
+        assert simulation.states[0, 2] / lean == pytest.approx(
+            np.exp(rate * 50 * kind.step_s), rel=2e-3
+        )
+    ratio = longer.unstable_rate_rad_s / plant("desktop").unstable_rate_rad_s
+    assert ratio == pytest.approx(1.2**-0.5)
+    seen, nominal = (
+        actual_camera(settings(pole_length=length)).render(STATES) for length in (1.2, 1.0)
+    )
+    changed = (seen != nominal).any(-1)
+    assert 0 < changed.sum() < 0.02 * changed.size  # the ends of the poles, and nothing else
+
+
+def test_longer_poles_of_what_has_none_are_refused() -> None:
+    with pytest.raises(UsageError, match="quadrotor"):
+        actual_plant(settings("quadrotor", pole_length=1.2))
+
+
+def test_a_controller_that_does_not_know_does_worse() -> None:
+    """The oracle predicts with the nominal equations: exact at 1.0 only."""
+
+    def score(**conditions: float) -> float:
+        simulator = Simulator(settings(**conditions), None)
+        block = Block("oracle", (Point("gap", 120.0),), 0, 16)
+        return float(simulator.run(block, lambda steps: None).score.mean())
+
+    assert score(pole_length=0.7) < score() - 0.1
+
+
+def test_digests_are_those_of_before_unless_conditions_changed() -> None:
+    shipped = json.loads((zoo_directory() / "desktop-h4m2l1" / "curves.json").read_text())["digest"]
+    assert Digest.of(shipped["checkpoint"], settings()).protocol == shipped["protocol"]
+    digests = {
+        Digest.of(None, settings(**conditions)).protocol
+        for conditions in ({}, {"light": 0.8}, {"camera_noise": 1.0}, {"pole_length": 0.9})
+    }
+    assert len(digests) == 4
