@@ -215,7 +215,7 @@ def test_an_interrupted_collection_keeps_its_shards(monkeypatch: pytest.MonkeyPa
         collect.run(SETTINGS, SCREEN, out=Path("part"))
     assert caught.value.hint == "hjepa resume part"
     other = dataclasses.replace(SETTINGS, seed=5)
-    with pytest.raises(UsageError, match="unfinished dataset with other settings"):
+    with pytest.raises(UsageError, match="with other settings: seed = 0, not 5"):
         collect.run(other, SCREEN, out=Path("part"))
     with open(f"part/{LOG}", "ab") as log:
         log.write(b'{"name": "shard-00')  # a kill in the middle of a line
@@ -254,7 +254,7 @@ def test_shards_cut_every_split() -> None:
 def test_no_room_is_said_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     usage = type("Usage", (), {"free": 1_000_000})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
-    with pytest.raises(Exception, match=r"0\.0 GB free; 0\.0 GB are needed") as caught:
+    with pytest.raises(Exception, match=r"1\.0 MB free; 4\.\d are needed") as caught:
         collect.run(SETTINGS, SCREEN, out=Path("full"))
     assert caught.value.exit_code == 74  # type: ignore[attr-defined]
     assert contents(Path("full")).keys() == {".lock"}

@@ -6,6 +6,7 @@ may be computed twice after a failure.
 """
 
 import dataclasses
+import importlib.metadata
 import importlib.util
 import logging
 import multiprocessing
@@ -21,6 +22,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeVar
 
+from hjepa_cli import __version__
 from hjepa_cli.errors import NumericalError, UsageError
 
 MAX_WORKERS = 8  # of some 400 MB each
@@ -28,6 +30,7 @@ IN_FLIGHT = 4  # units submitted per worker: enough to keep it busy, few enough 
 LOCAL = "local"
 RETRIES = 3  # of a unit whose Dask worker died
 CONNECT_S = 10
+NUMBERS_FROM = ("numpy", "pymunk", "scipy", "torch")  # another version, other last digits
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -167,12 +170,13 @@ def worker_pool(
     Spawned, not forked: torch's threads do not survive a fork.
     """
     context = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())  # of the program that calls us
     pool = ProcessPoolExecutor(count, context, initializer=initializer, initargs=arguments)
     with anonymous_main():
         try:
             yield pool
         except BaseException:
-            for process in multiprocessing.active_children():
+            for process in set(multiprocessing.active_children()) - others:
                 process.terminate()
             raise
         finally:
@@ -186,7 +190,8 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
     Workers of other machines must have the same version installed and see the same files.
 
     Raises:
-        UsageError: no scheduler answers at ``where``.
+        UsageError: no scheduler answers at ``where``, it has no workers, or they would compute
+            something else.
     """
     import distributed
 
@@ -212,6 +217,7 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
                 hint=f"hjepa ... --cluster {LOCAL}, or start one: dask scheduler",
             ) from None
         try:
+            check_cluster(client, where)
             threads = sum(client.nthreads().values())
             yield client.get_executor(retries=RETRIES, pure=False), max(threads, 1)
         finally:
@@ -219,6 +225,44 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
             if where == LOCAL:
                 with suppress(TimeoutError):  # the work is done; they end with us
                     target["address"].close()
+
+
+def versions() -> dict[str, str]:
+    """What the numbers of this process depend on."""
+    return {"hjepa": __version__} | {
+        name: importlib.metadata.version(name) for name in NUMBERS_FROM
+    }
+
+
+def check_cluster(client: Any, where: str) -> None:
+    """Demand workers, and of every one the versions that are here: others give other numbers.
+
+    Raises:
+        UsageError: naming what is missing or differs.
+    """
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError:
+        raise UsageError(
+            f"--cluster {where}: the scheduler has no workers",
+            hint="dask worker --nthreads 1 with the scheduler's address or --scheduler-file FILE",
+        ) from None
+    here = versions()
+    try:
+        found: dict[str, dict[str, str]] = client.run(versions)
+    except Exception as error:  # whatever unpickling there raises
+        raise UsageError(
+            f"--cluster {where}: a worker cannot import hjepa: {error}",
+            hint=f"pip install hjepa=={here['hjepa']} where workers and scheduler run",
+        ) from None
+    for worker, there in found.items():
+        differing = [name for name in here if there.get(name) != here[name]]
+        if differing:
+            shown = ", ".join(f"{name} {there.get(name)}, not {here[name]}" for name in differing)
+            raise UsageError(
+                f"--cluster {where}: worker {worker} has {shown}",
+                hint="install the same versions everywhere: pip freeze tells those that are here",
+            )
 
 
 @contextmanager
