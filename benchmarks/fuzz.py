@@ -311,10 +311,9 @@ class Progress(Target):
             name = chance.choice(sorted(arrays))
             array = arrays.pop(name)
             if chance.random() < 0.7:
-                changed = (array[..., :1], array[None], array.astype(np.int64), -array)
-                arrays[chance.choice((name, "layer.x", "optimiser.-1.step"))] = chance.choice(
-                    changed
-                )
+                cut, whole = np.atleast_1d(array)[..., :1], array.astype(np.int64)
+                name = chance.choice((name, "layer.x", "optimiser.-1.step"))
+                arrays[name] = chance.choice((cut, whole, array[None], -array))
         metadata = mutate_json(self.metadata, chance) if chance.random() < 0.7 else self.metadata
         return self._write(self.file, seal(arrays, metadata, chance))
 

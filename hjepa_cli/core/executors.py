@@ -19,11 +19,13 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
 from hjepa_cli import __version__
 from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.interrupts import SIGNALS
 
 MAX_WORKERS = 8  # of some 400 MB each
 IN_FLIGHT = 4  # units submitted per worker: enough to keep it busy, few enough to stop soon
@@ -177,7 +179,7 @@ def worker_pool(
             yield pool
         except BaseException:
             for process in set(multiprocessing.active_children()) - others:
-                process.terminate()
+                process.kill()
             raise
         finally:
             pool.shutdown(cancel_futures=True)
@@ -199,14 +201,14 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # a lost worker is no news here
     with anonymous_main():
         if where == LOCAL:
-            target: dict[str, Any] = {
-                "address": dask.LocalCluster(
+            with signals_blocked():
+                local = dask.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
                     dashboard_address="127.0.0.1:0",  # None is port 8787, one per machine
                     silence_logs=logging.CRITICAL,
                 )
-            }
+            target: dict[str, Any] = {"address": local}
         else:
             target = {"scheduler_file": where} if Path(where).is_file() else {"address": where}
         try:
@@ -282,9 +284,24 @@ def anonymous_main() -> Iterator[None]:
             main["__file__"] = file
 
 
+@contextmanager
+def signals_blocked() -> Iterator[None]:
+    """Keep Ctrl-C and SIGTERM from threads and processes that are started here, for good.
+
+    They inherit the mask; in this thread a signal waits until the ``with`` block ends.
+    """
+    resource_tracker.ensure_running()  # its start would unblock them in the thread it happens in
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def prepare_worker() -> None:
-    """Ctrl-C is the parent's; a worker ends when the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ctrl-C and SIGTERM, which reach the whole group, are the parent's; a worker ends with it."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
