@@ -272,6 +272,7 @@ def set_first_shard(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (lambda m: m["splits"]["train"].update(trajectories=8), "lacks fields"),
         (lambda m: m["splits"]["train"].update(trajectories="7"), "lacks fields"),
         (lambda m: m.update(plant="moon"), "moon"),
+        (lambda m: m["config"].update(collect=3), "lacks fields"),
         (set_first_shard(name="../shard-00000.safetensors"), "malformed"),
         (set_first_shard(name="/etc/passwd"), "malformed"),
         (set_first_shard(name="shard-00000.safetensors\n"), "malformed"),

@@ -143,7 +143,8 @@ class Optimiser:
             number, _, name = key.partition(".")
             known = number.isdecimal() and int(number) < len(self.parameters) and name in MOMENTS
             parameter = self.parameters[int(number)] if known else None
-            if parameter is None or value.shape != (() if name == "step" else parameter.shape):
+            shape = () if name == "step" or parameter is None else parameter.shape
+            if parameter is None or value.shape != shape or (name == "step" and value < 1):
                 raise ValueError(f"optimiser state {key} of shape {tuple(value.shape)}")
             if value.dim():  # in the parameter's memory layout, or the last bits come out otherwise
                 value = torch.empty_like(parameter).copy_(value)

@@ -361,6 +361,7 @@ def _check_manifest(manifest: Mapping[str, Any], path: Path) -> None:
         good = (
             isinstance(manifest["plant"], str)
             and isinstance(manifest["config"], dict)
+            and isinstance(manifest["config"].get("collect", {}), dict)
             and isinstance(manifest["camera"], dict)
             and manifest["frames"] in ("stored", "rendered")
             and 0 < len(manifest["splits"].keys() & set(SPLITS)) == len(manifest["splits"])
