@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hjepa_cli import __version__
-from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.errors import ClusterLost, HjepaError, NumericalError, UsageError
 from hjepa_cli.interrupts import SIGNALS
 
 MAX_WORKERS = 8  # of some 400 MB each
@@ -194,11 +194,13 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
     Raises:
         UsageError: no scheduler answers at ``where``, it has no workers, or they would compute
             something else.
+        ClusterLost: it ends before the ``with`` block.
     """
     import distributed
 
     dask: Any = distributed  # it has no types
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # a lost worker is no news here
+    for name in ("distributed", "distributed.client"):  # a lost worker is no news here
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with anonymous_main():
         if where == LOCAL:
             with signals_blocked():
@@ -222,6 +224,15 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
             check_cluster(client, where)
             threads = sum(client.nthreads().values())
             yield client.get_executor(retries=RETRIES, pure=False), max(threads, 1)
+        except HjepaError:
+            raise
+        except Exception:
+            if client.status == "running":
+                raise
+            raise ClusterLost(
+                f"--cluster {where}: the scheduler has gone; what is finished is kept",
+                hint="start it and its workers, then run the same command again",
+            ) from None
         finally:
             client.close()
             if where == LOCAL:

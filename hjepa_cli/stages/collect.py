@@ -24,7 +24,7 @@ from hjepa_cli.core.payload import raw_frame_bits
 from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.core.system import Camera
 from hjepa_cli.core.trajectories import generate, split_sizes
-from hjepa_cli.errors import DataError, Interrupted, StorageError, UsageError
+from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.interrupts import exit_code
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, dotted, load_settings
@@ -124,7 +124,7 @@ def telling_how_to_go_on(directory: Path) -> Iterator[None]:
             hint=continue_command(directory),
             code=exit_code(error),
         ) from None
-    except StorageError as error:
+    except HjepaError as error:
         point_to(continue_command(directory), error)
         raise
 

@@ -20,7 +20,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from hjepa_cli.errors import DataError, LockedError, MissingInputError, StorageError
+from hjepa_cli.errors import (
+    DataError,
+    HjepaError,
+    LockedError,
+    MissingInputError,
+    StorageError,
+)
 
 LOCK_FILE = ".lock"
 JSON_LIMIT_BYTES = 16 * 2**20
@@ -28,7 +34,7 @@ JSON_LIMIT_BYTES = 16 * 2**20
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp")  # .<name>.<random>.<pid>.tmp
 _HOLDER = re.compile(rb"process \d{1,20} on [\w.-]{1,64}")
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_FREE_SPACE = "free some disk space, then "
+_AGAIN = "run the same command again"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -276,7 +282,7 @@ def is_temporary(name: str) -> bool:
 def storage_error(path: Path, error: OSError) -> StorageError:
     """Turn an OSError on ``path`` into one line with the next step."""
     if error.errno in _NO_SPACE:
-        hint = _FREE_SPACE + "run the same command again"
+        hint = f"free some disk space, then {_AGAIN}"
     else:
         hint = "choose a directory that you may write to with --out DIR"
     return StorageError(f"cannot write {path}: {error.strerror or error}", hint=hint)
@@ -293,9 +299,11 @@ def check_free_space(directory: Path, size_bytes: int) -> None:
 
 
 def point_to(command: str, error: BaseException | None) -> None:
-    """Let the hint of a full disk name the command that goes on."""
-    if isinstance(error, StorageError) and (error.hint or "").startswith(_FREE_SPACE):
-        error.hint = _FREE_SPACE + command
+    """Let a hint to repeat the command name the one that goes on: without --out, the same one
+    begins again in a new directory.
+    """
+    if isinstance(error, HjepaError) and (error.hint or "").endswith(_AGAIN):
+        error.hint = f"{(error.hint or '').removesuffix(_AGAIN)}{command}"
 
 
 def _writing(pid: int) -> bool:
