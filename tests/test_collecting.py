@@ -115,13 +115,22 @@ def test_ctrl_c_at_the_last_moment_goes_on_too(monkeypatch: pytest.MonkeyPatch) 
     assert contents(Path("data/desktop-0001")) == contents(Path("whole"))
 
 
-def test_a_log_left_beside_a_finished_dataset_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "go_on",
+    [
+        lambda: collect.run(small(), SCREEN, out=Path("data")),
+        lambda: resume.run(Path("data"), SCREEN),
+    ],
+)
+def test_a_log_left_beside_a_finished_dataset_goes(
+    go_on: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A kill between writing the one and removing the other."""
     with monkeypatch.context() as patch:
         patch.setattr(collect, "remove_log", lambda _: None)
         collect.run(small(), SCREEN, out=Path("data"))
     assert Path("data", LOG).exists()
-    assert collect.run(small(), SCREEN, out=Path("data"))["trajectories"] == 5
+    assert go_on()["trajectories"] == 5
     assert not Path("data", LOG).exists()
 
 
