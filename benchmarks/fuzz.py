@@ -26,13 +26,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from hjepa_cli import models
+from hjepa_cli import data, models
 from hjepa_cli.checks import check_settings
 from hjepa_cli.core.cell import Cell, Need
 from hjepa_cli.core.model import Model, build_modules, tensors_of
+from hjepa_cli.core.training import Optimiser
 from hjepa_cli.errors import HjepaError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
+from hjepa_cli.stages import progress
 from hjepa_cli.storage import curves, datasets, files, runs, shards, tensors
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 
@@ -178,7 +180,7 @@ class Dataset(Target):
         )
         datasets.write_dataset(
             self.path,
-            settings={"seed": 0},
+            settings={"seed": 0, "collect": load_settings().as_dict()["collect"]},
             splits={"train": part, "clean": part},
             plant_name="desktop",
             camera_manifest={},
@@ -208,6 +210,8 @@ class Dataset(Target):
         found = datasets.load_dataset(self.path)
         for name in found.splits:
             found.split(name)
+        data.show_info(QUIET, self.path)
+        curves.Digest.of("0" * 64, load_settings(), found.settings)
 
 
 class Curves(Target):
@@ -265,6 +269,66 @@ class Records(Target):
         runs.read_environment(self.path)
 
 
+class Progress(Target):
+    """The saved state of a training: bytes, or resealed metadata and tensors."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.run = runs.Run.create("eval", self.path, load_settings().as_dict())
+        self.run.resumed = True
+        self.file = self.path / progress.PROGRESS_FILE
+        for _ in self._start().steps("a", 2, *self._parts()):
+            pass
+        saved = load_checkpoint(self.file)
+        self.good, self.arrays, self.metadata = (
+            self.file.read_bytes(),
+            saved.tensors,
+            saved.metadata,
+        )
+
+    def _start(self) -> progress.Progress:
+        return progress.Progress(self.run, QUIET)
+
+    def _parts(self) -> tuple[dict[str, progress.Part], np.random.Generator]:
+        layer = torch.nn.Linear(2, 2)
+        optimiser = Optimiser(
+            layer.parameters(),
+            name="adamw",
+            schedule="constant",
+            steps=2,
+            learning_rate=0.1,
+            weight_decay=0.0,
+            gradient_clip=0.0,
+        )
+        optimiser.step(layer(torch.ones(1, 2)).sum(), 0)
+        return {"layer": layer, "optimiser": optimiser}, np.random.default_rng(0)
+
+    def damage(self, chance: random.Random) -> int:
+        if chance.random() < 0.3:
+            return self._write(self.file, mutate_bytes(self.good, chance))
+        arrays = dict(self.arrays)
+        if chance.random() < 0.4:
+            name = chance.choice(sorted(arrays))
+            array = arrays.pop(name)
+            if chance.random() < 0.7:
+                cut, whole = np.atleast_1d(array)[..., :1], array.astype(np.int64)
+                name = chance.choice((name, "layer.x", "optimiser.-1.step"))
+                arrays[name] = chance.choice((cut, whole, array[None], -array))
+        metadata = mutate_json(self.metadata, chance) if chance.random() < 0.7 else self.metadata
+        return self._write(self.file, seal(arrays, metadata, chance))
+
+    def read(self) -> None:
+        threads = torch.get_num_threads()
+        parts, stream = self._parts()
+        try:
+            started = self._start()
+            for _ in started.steps("a", 3, parts, stream):
+                parts["optimiser"].step(parts["layer"](torch.ones(1, 2)).sum(), 0)  # type: ignore
+                stream.random()
+        finally:
+            torch.set_num_threads(threads)
+
+
 class Toml(Target):
     """``--config FILE.toml``."""
 
@@ -286,8 +350,16 @@ class Toml(Target):
         check_settings(load_settings(config=self.path))
 
 
-TARGETS: tuple[type[Target], ...] = (Checkpoint, Dataset, Curves, Records, Toml, Networks)
-SHARES = (30, 25, 15, 15, 14, 1)  # in percent; a model takes as long as a hundred others
+TARGETS: tuple[type[Target], ...] = (
+    Checkpoint,
+    Dataset,
+    Curves,
+    Records,
+    Progress,
+    Toml,
+    Networks,
+)
+SHARES = (28, 24, 15, 12, 8, 12, 1)  # in percent; a model takes as long as a hundred others
 
 
 def seal(arrays: dict[str, Any], metadata: Any, chance: random.Random) -> bytes:

@@ -1,14 +1,16 @@
 """Stages that are killed: SIGKILL at random moments, again and again, then to the end.
 
     python benchmarks/kill.py --kills 20 --seed 0
+    python benchmarks/kill.py --every 1 --stages collect,eval
 
 Every stage runs in a child process of its own and is killed right before one of its calls that
 touch the disk, drawn among all of them. Between two such calls a kill finds the same disk at any
 time, so these are all the moments there are (but for those inside a single write, of which
 tests/test_files.py takes care), and they do not depend on the machine's speed. After each kill,
-every file that is there under its own name must load; the same command is then given again. In
-the end datasets, checkpoints, ``metrics.csv``, curves and tables must be the bytes of a run that
-was not killed. Prints kills, and how many came during a write.
+every file that is there under its own name must load; then the same command is given again, in the
+end ``hjepa resume``. Datasets, checkpoints, ``metrics.csv``, curves and tables must be the bytes of
+a run that was not killed, and no other file may be left. Prints kills, and how many came during a
+write. ``--every N`` kills before every Nth call instead, one kill a run; 1 leaves no moment out.
 """
 
 import argparse
@@ -16,6 +18,7 @@ import io
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -31,16 +34,23 @@ import torch
 
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
-from hjepa_cli.stages import collect, evaluate, progress, scale, train_encoder, train_hierarchy
+from hjepa_cli.stages import (
+    collect,
+    evaluate,
+    progress,
+    resume,
+    scale,
+    train_encoder,
+    train_hierarchy,
+)
 from hjepa_cli.storage import datasets, files
 from hjepa_cli.storage.checkpoints import load_checkpoint
 from hjepa_cli.storage.datasets import load_dataset
-from hjepa_cli.storage.runs import METRICS, RESULT
+from hjepa_cli.storage.runs import CONFIG, METRICS, RESULT
+from hjepa_cli.storage.shards import LOG
 
 STAGES = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
-DISK = frozenset(
-    ("open", "write", "flush", "close", "__exit__", "fsync", "replace", "unlink", "mkdir")
-)
+DISK = frozenset("open write flush truncate close __exit__ fsync replace unlink mkdir".split())
 COMPARED = ("*.safetensors", "dataset.json", METRICS, "curves.json", "devices.csv", "config.toml")
 SETTINGS = load_settings(
     flags={
@@ -76,12 +86,18 @@ SETTINGS = load_settings(
 
 
 def run_stage(
-    stage: str, root: Path, out: Path, last: int = 0, calls: "Synchronized[int] | None" = None
+    stage: str,
+    root: Path,
+    out: Path,
+    last: int = 0,
+    resumed: bool = False,
+    calls: "Synchronized[int] | None" = None,
 ) -> None:
     """Run one stage into ``out``, saving its state after every step; the target of the child.
 
     Args:
         last: number of the call to the disk before which the process is killed; 0: never.
+        resumed: by ``hjepa resume`` where there is something to resume.
         calls: is told how many there were.
     """
     count = 0
@@ -94,19 +110,21 @@ def run_stage(
                 os.kill(os.getpid(), signal.SIGKILL)
 
     sys.setprofile(look)
-    _run_stage(stage, root, out)
+    _run_stage(stage, root, out, resumed)
     sys.setprofile(None)
     if calls is not None:
         calls.value = count
 
 
-def _run_stage(stage: str, root: Path, out: Path) -> None:
+def _run_stage(stage: str, root: Path, out: Path, resumed: bool) -> None:
     torch.set_num_threads(1)
     progress.SAVE_EVERY_S = 0.0
     datasets.SHARD_TRAJECTORIES = 1
     screen = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
     data, encoder = root / "collect", str(root / "train-encoder")
-    if stage == "collect":
+    if resumed and any((out / name).exists() for name in (CONFIG, LOG, datasets.MANIFEST)):
+        resume.run(out, screen)
+    elif stage == "collect":
         collect.run(SETTINGS, screen, out=out)
     elif stage == "train-encoder":
         train_encoder.run(SETTINGS, screen, dataset=data, out=out)
@@ -177,7 +195,7 @@ def kill_stage(
         killed += code != 0
         writing += check_files(out)
         calls = max(calls - last, 1)
-    code = run_child(chosen, stage, root, out)
+    code = run_child(chosen, stage, root, out, 0, True)
     assert code == 0, f"{stage} does not go on: {code}"
     compare(root / stage, out)
     assert check_files(out) == 0, "half-written files are left behind"
@@ -186,10 +204,10 @@ def kill_stage(
 
 def compare(whole: Path, killed: Path) -> None:
     """Demand equal names and equal bytes of all that a stage makes."""
+    names = [sorted(os.listdir(directory)) for directory in (whole, killed)]
+    assert names[0] == names[1], f"{killed} holds {names[1]}, not {names[0]}"
     for pattern in COMPARED:
-        names = sorted(path.name for path in whole.glob(pattern))
-        assert names == sorted(path.name for path in killed.glob(pattern)), (killed, pattern)
-        for name in names:
+        for name in sorted(path.name for path in whole.glob(pattern)):
             assert (whole / name).read_bytes() == (killed / name).read_bytes(), killed / name
     assert (killed / RESULT).exists() or (killed / datasets.MANIFEST).exists()
 
@@ -197,31 +215,39 @@ def compare(whole: Path, killed: Path) -> None:
 def run_whole(chosen: BaseContext, stage: str, root: Path) -> int:
     """Run a stage without a kill into ``root/stage``; return how often it touches the disk."""
     calls = chosen.Value("q", 0)
-    assert run_child(chosen, stage, root, root / stage, 0, calls) == 0, stage
+    assert run_child(chosen, stage, root, root / stage, 0, False, calls) == 0, stage
     return int(calls.value)
 
 
 def main(report: Callable[[str], None] = print) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=20, help="per stage")
+    parser.add_argument("--every", type=int, default=0, help="instead: before every Nth call")
+    parser.add_argument("--stages", default=",".join(STAGES), help="those that are killed")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     chance, chosen = random.Random(options.seed), context()
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         for stage in STAGES:
-            started = time.monotonic()
-            calls = run_whole(chosen, stage, root)
-            killed = writing = runs = 0
-            while killed < options.kills:  # each kill of a run leaves less to do: a few per run
-                moments = [chance.random() for _ in range(min(4, options.kills - killed))]
-                out = root / f"{stage}-{runs}"
+            calls = run_whole(chosen, stage, root)  # the next ones read what it makes
+            if stage not in options.stages.split(","):
+                continue
+            if options.every:
+                schedule = [[(last + 0.5) / calls] for last in range(0, calls, options.every)]
+            else:  # each kill of a run leaves less to do: a few per run
+                moments = [chance.random() for _ in range(options.kills)]
+                schedule = [moments[start : start + 4] for start in range(0, options.kills, 4)]
+            started, killed, writing = time.monotonic(), 0, 0
+            for moments in schedule:
+                out = root / f"{stage}-killed"
                 hit, inside = kill_stage(chosen, stage, root, out, calls, moments)
-                killed, writing, runs = killed + hit, writing + inside, runs + 1
+                killed, writing = killed + hit, writing + inside
+                shutil.rmtree(out)
             report(
-                f"{stage}: {calls} calls to the disk; {killed} kills in {runs} runs, {writing} "
-                f"during a write, in {time.monotonic() - started:.0f} s; all files load, all ends "
-                "are equal"
+                f"{stage}: {calls} calls to the disk; {killed} kills in {len(schedule)} runs, "
+                f"{writing} during a write, in {time.monotonic() - started:.0f} s; all files load, "
+                "all ends are equal"
             )
 
 

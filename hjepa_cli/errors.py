@@ -51,6 +51,12 @@ class StorageError(HjepaError):
     exit_code = 74
 
 
+class ClusterLost(HjepaError):
+    """The scheduler of a cluster has gone in the middle of the work."""
+
+    exit_code = 74
+
+
 class LockedError(HjepaError):
     """Another process works in the same run directory."""
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import struct
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,20 @@ def test_a_huge_header_is_not_even_read(tmp_path: Path) -> None:
         load_checkpoint(tmp_path / "a")
 
 
+def test_what_could_not_be_read_again_is_not_written(path: Path) -> None:
+    good = path.read_bytes()
+    with pytest.raises(ValueError, match="readers accept 1048576"):
+        save_checkpoint(path, TENSORS, {"text": "x" * 2**20})
+    assert path.read_bytes() == good
+    large = struct.pack("<Q", 2**20 + 8) + b"[" + b"0," * 2**19 + b"0]     "
+    path.write_bytes(large)
+    tracemalloc.start()
+    with pytest.raises(DataError, match="header is longer"):
+        load_checkpoint(path)
+    assert tracemalloc.get_traced_memory()[1] < 2 * len(large)
+    tracemalloc.stop()
+
+
 def test_tampered_metadata_is_refused(path: Path) -> None:
     good = path.read_bytes()
     assert good.count(b'\\"h\\":4') == 1
@@ -271,3 +286,11 @@ def test_check_tensors_names_the_first_difference(path: Path) -> None:
     del expected["frame_mean"]
     with pytest.raises(DataError, match="'frame_mean' is unexpected"):
         check_tensors(checkpoint, expected)
+
+
+def test_a_dimension_beyond_all_numbers_is_refused(tmp_path: Path) -> None:
+    """No bytes at all, so that safetensors itself has no objection."""
+    header = b'{"a":{"dtype":"F32","shape":[0,9223372036854775808],"data_offsets":[0,0]}}'
+    (tmp_path / "a").write_bytes(struct.pack("<Q", len(header)) + header)
+    with pytest.raises(DataError, match="damaged"):
+        load_checkpoint(tmp_path / "a")

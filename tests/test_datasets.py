@@ -17,6 +17,7 @@ from hjepa_cli.errors import (
     HjepaError,
     LockedError,
     MissingInputError,
+    NumericalError,
     StorageError,
     UsageError,
 )
@@ -267,7 +268,11 @@ def set_first_shard(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (lambda m: m["splits"]["test"].update(steps=4), "expected float32"),
         (lambda m: m["splits"]["test"].update(steps="5"), "lacks fields"),
         (lambda m: m.update(frames="stored"), "expected .*frames"),
-        (set_first_shard(trajectories=8), "expected float32"),
+        (set_first_shard(trajectories=8), "lacks fields"),
+        (lambda m: m["splits"]["train"].update(trajectories=8), "lacks fields"),
+        (lambda m: m["splits"]["train"].update(trajectories="7"), "lacks fields"),
+        (lambda m: m.update(plant="moon"), "moon"),
+        (lambda m: m["config"].update(collect=3), "lacks fields"),
         (set_first_shard(name="../shard-00000.safetensors"), "malformed"),
         (set_first_shard(name="/etc/passwd"), "malformed"),
         (set_first_shard(name="shard-00000.safetensors\n"), "malformed"),
@@ -308,8 +313,11 @@ def test_what_is_not_finite_is_neither_written_nor_read(
             camera_manifest=CAMERA,
         )
 
-    with pytest.raises(DataError, match=f"'{field}' holds NaN or an infinity"):
+    last = 5 if field == "states" else 4
+    where = f"trajectory 1 of split 'test': '{field}' is not finite from index {last} on"
+    with pytest.raises(NumericalError, match=where) as caught:
         attempt()
+    assert caught.value.exit_code == 70
     assert not (tmp_path / "d" / MANIFEST).exists()
     with monkeypatch.context() as patch:
         patch.setattr(arrays, "non_finite", lambda _: None)
@@ -413,3 +421,14 @@ def test_errors_are_single_lines(path: Path) -> None:
     with pytest.raises(HjepaError) as caught:
         load_dataset(path)
     assert "\n" not in caught.value.message
+
+
+def test_a_shard_larger_than_its_tensors_is_not_even_read(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = load_dataset(path)
+    with open(path / "shard-00000.safetensors", "r+b") as file:
+        file.truncate(2**31)  # sparse: it takes no room on the disk
+    monkeypatch.setattr(Path, "read_bytes", lambda _: pytest.fail("it was read"))
+    with pytest.raises(DataError, match=r"too large: 2147483648 bytes, at most 1049536 are"):
+        data.split("train")

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from test_evaluate import untrained
 
 from hjepa_cli.core import executors
 from hjepa_cli.core.executors import InProcess, finished, open_executor, placed
-from hjepa_cli.errors import Interrupted, NumericalError, UsageError
+from hjepa_cli.errors import ClusterLost, Interrupted, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
 from hjepa_cli.stages import collect, resume, scale
@@ -215,7 +216,7 @@ def test_an_interrupted_collection_keeps_its_shards(monkeypatch: pytest.MonkeyPa
         collect.run(SETTINGS, SCREEN, out=Path("part"))
     assert caught.value.hint == "hjepa resume part"
     other = dataclasses.replace(SETTINGS, seed=5)
-    with pytest.raises(UsageError, match="unfinished dataset with other settings"):
+    with pytest.raises(UsageError, match="with other settings: seed = 0, not 5"):
         collect.run(other, SCREEN, out=Path("part"))
     with open(f"part/{LOG}", "ab") as log:
         log.write(b'{"name": "shard-00')  # a kill in the middle of a line
@@ -254,7 +255,7 @@ def test_shards_cut_every_split() -> None:
 def test_no_room_is_said_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     usage = type("Usage", (), {"free": 1_000_000})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
-    with pytest.raises(Exception, match=r"0\.0 GB free; 0\.0 GB are needed") as caught:
+    with pytest.raises(Exception, match=r"1\.0 MB free; 4\.\d are needed") as caught:
         collect.run(SETTINGS, SCREEN, out=Path("full"))
     assert caught.value.exit_code == 74  # type: ignore[attr-defined]
     assert contents(Path("full")).keys() == {".lock"}
@@ -294,3 +295,71 @@ def test_places_are_forgotten_afterwards() -> None:
     with placed(3, None):
         assert executors.placement().workers == 3
     assert executors.placement().workers is None
+
+
+class Told:
+    """A client of a cluster that answers as it is told."""
+
+    def __init__(self, answer: dict[str, dict[str, str]] | Exception) -> None:
+        self.answer = answer
+
+    def wait_for_workers(self, count: int, timeout: float) -> None:
+        if self.answer == {}:
+            raise TimeoutError
+
+    def run(self, function: Any) -> dict[str, dict[str, str]]:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+def test_workers_must_be_there_and_compute_the_same() -> None:
+    here = executors.versions()
+    executors.check_cluster(Told({"tcp://a:1": here, "tcp://b:1": dict(here)}), "x")
+    for answer, message in (
+        ({}, "--cluster x: the scheduler has no workers"),
+        ({"tcp://a:1": here, "tcp://b:1": here | {"pymunk": "6"}}, r"tcp://b:1 has pymunk 6, not "),
+        ({"tcp://a:1": {}}, r"hjepa None, not "),
+        (ModuleNotFoundError("No module named 'hjepa_cli'"), "cannot import hjepa: No module"),
+    ):
+        with pytest.raises(UsageError, match=message) as caught:
+            executors.check_cluster(Told(answer), "x")
+        assert caught.value.hint
+
+
+def test_a_scheduler_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed: Any = pytest.importorskip("distributed")
+
+    class Client(Told):
+        def __init__(self, **_: Any) -> None:
+            super().__init__({"tcp://a:1": executors.versions()})
+            self.status = "running"
+
+        def nthreads(self) -> dict[str, int]:
+            return {"tcp://a:1": 2}
+
+        def get_executor(self, **_: Any) -> Any:
+            return self
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(distributed, "Client", Client)
+    with (
+        pytest.raises(ClusterLost, match="the scheduler has gone; what is finished") as caught,
+        executors.open_cluster("tcp://there:1", 1) as (client, threads),
+    ):
+        assert threads == 2
+        client.status = "closed"  # type: ignore[attr-defined]
+        raise CancelledError
+    assert caught.value.exit_code == 74
+    for error in (RuntimeError("a bug of ours"), UsageError("of a unit")):
+        with pytest.raises(type(error)), executors.open_cluster("tcp://there:1", 1):
+            raise error
+
+
+def test_hints_to_repeat_name_the_command_that_goes_on() -> None:
+    """The same command without --out would begin again elsewhere."""
+    with pytest.raises(NumericalError) as caught, collect.telling_how_to_go_on(Path("data")):
+        raise executors._worker_died()
+    assert caught.value.hint == "free some memory, then hjepa resume data"

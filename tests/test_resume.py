@@ -325,23 +325,138 @@ def test_another_dataset_is_another_run(
     assert f"hjepa resume {out}" in str(caught.value.hint)
 
 
-def test_a_full_disk_names_the_command_that_goes_on(
-    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("what", [PROGRESS_FILE, "model.safetensors", runs.RESULT])
+def test_a_full_disk_loses_nothing_and_names_the_command_that_goes_on(
+    what: str, workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "run"
+    """At the third save of the state, at the model, at the very last file."""
+    out, replace, seen = tmp_path / "run", os.replace, 0
 
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+    def full(source: Path, target: Path) -> None:
+        nonlocal seen
+        seen += target.name == what
+        if target.name == what and seen == (3 if what == PROGRESS_FILE else 1):
+            raise OSError(28, "No space left on device")
+        replace(source, target)
 
     with monkeypatch.context() as patched:
         patched.setattr(progress, "SAVE_EVERY_S", 0.0)
-        patched.setattr(progress, "save_checkpoint", lambda *_: runs.files.write_bytes(*_[:1], b""))
         patched.setattr(os, "replace", full)
-        patched.setattr(runs.files, "write_json", lambda *_: None)
-        patched.setattr(runs.files, "write_text", lambda path, text: path.write_text(text))
-        with pytest.raises(StorageError, match="No space left") as caught:
+        with pytest.raises(StorageError, match=f"cannot write .*{what}: No space left") as caught:
             trainer("train-encoder", workplace)(out)
     assert caught.value.hint == f"free some disk space, then hjepa resume {out}"
+    assert not [name for name in os.listdir(out) if name.endswith(".tmp")]
+    saved = load_checkpoint(out / PROGRESS_FILE).metadata["step"]
+    assert saved == (2 if what == PROGRESS_FILE else 5)
+    trainer("train-encoder", workplace)(out)
+    assert_equal_runs(out, workplace / "train-encoder")
+
+
+@pytest.mark.slow
+def test_a_disk_that_really_refuses(workplace: Path, tmp_path: Path) -> None:
+    """A limit on the size of files, which the kernel keeps as it keeps a quota; exit 74."""
+    config = tmp_path / "config.toml"
+    config.write_text(runs.to_toml(settings().as_dict()))
+    limited = (
+        "import resource, sys\n"
+        "from hjepa_cli.cli import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
+        "main(sys.argv[1:])"
+    )
+    words = ["train-encoder", "--dataset", workplace / "data", "--config", config, "--out", "run"]
+    ended = subprocess.run(
+        [sys.executable, "-c", limited, *words, "--quiet"],
+        cwd=tmp_path,
+        env=ENVIRONMENT | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 74, ended.stderr
+    assert re.fullmatch(
+        rf"error: cannot write run/{PROGRESS_FILE}: File too large\n"
+        r"hint: free some disk space, then hjepa resume run\n",
+        ended.stderr,
+    )
+    assert not [name for name in os.listdir(tmp_path / "run") if "safetensors" in name]
+    resume.run(tmp_path / "run", QUIET)
+    assert_equal_runs(tmp_path / "run", workplace / "train-encoder")
+
+
+def test_a_long_history_outgrows_no_header(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows of metrics.csv beyond what the header of a file may hold come back like any others."""
+    out, rows = tmp_path / "run", "0.5," * 300_000 + "\n"
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        signal_after(patched, 2)
+        metrics = runs.Run.metrics
+        longer = property(lambda run: rows + metrics.fget(run), metrics.fset)  # type: ignore[misc]
+        patched.setattr(runs.Run, "metrics", longer)
+        with pytest.raises(Interrupted):
+            trainer("train-encoder", workplace)(out)
+    (out / runs.METRICS).unlink(missing_ok=True)
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        crash_after(patched, 0)
+        with pytest.raises(RuntimeError, match="crash"):
+            trainer("train-encoder", workplace)(out)
+    assert (out / runs.METRICS).read_text().startswith(rows)
+
+
+def test_a_state_whose_metrics_were_in_the_header_goes_on(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it was written at first."""
+    out = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        signal_after(patched, 4)
+        with pytest.raises(Interrupted):
+            trainer("train-encoder", workplace)(out)
+    saved = load_checkpoint(out / PROGRESS_FILE)
+    tensors = dict(saved.tensors)
+    text = tensors.pop(progress.METRICS_ROWS).tobytes().decode()
+    assert text == (out / runs.METRICS).read_text() and text.count("\n") >= 2
+    save_checkpoint(out / PROGRESS_FILE, tensors, saved.metadata | {"metrics": text})
+    (out / runs.METRICS).write_text("")
+    trainer("train-encoder", workplace)(out)
+    assert_equal_runs(out, workplace / "train-encoder")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"step": "2"},
+        {"step": -1},
+        {"step": 10**9},
+        {"phase": "jepb"},
+        {"finished": "jepa"},
+        {"threads": 0},
+        {"threads": 10**9},
+        {"stream": {}},
+        {"stream": {"state": [2**70]}},
+        {"seconds": None},
+        {"metrics": 3},
+    ],
+    ids=str,
+)
+def test_a_state_that_lies_is_refused(
+    change: dict[str, Any], workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sealed well, and wrong: no traceback, no other number of threads, no untrained model."""
+    out, threads = tmp_path / "run", torch.get_num_threads()
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        signal_after(patched, 1)
+        with pytest.raises(Interrupted):
+            trainer("train-encoder", workplace)(out)
+    saved = load_checkpoint(out / PROGRESS_FILE)
+    save_checkpoint(out / PROGRESS_FILE, saved.tensors, saved.metadata | change)
+    with pytest.raises(DataError, match="does not fit this run") as caught:
+        trainer("train-encoder", workplace)(out)
+    assert "\n" not in caught.value.message and f"rm {out}" in (caught.value.hint or "")
+    assert torch.get_num_threads() == threads and not (out / "model.safetensors").exists()
 
 
 def test_a_diverging_run_saves_nothing_that_is_not_finite(

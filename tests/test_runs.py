@@ -233,7 +233,9 @@ def test_a_second_process_is_locked_out() -> None:
             Run.create("eval", Path("out"), SETTINGS)
         second = run_elsewhere(code)
         assert second.returncode == 75, second.stderr
-        assert second.stdout == "another process is working in out\n"
+        assert second.stdout.startswith(
+            f"another process is working in out: process {os.getpid()} on "
+        )
     third = run_elsewhere(code)
     assert third.returncode == 0, third.stderr
 
@@ -251,3 +253,65 @@ def test_newest_run_is_finished_and_fits() -> None:
     assert newest_run("train-encoder", is_desktop) == Path("runs/train-encoder/b")
     assert newest_run("train-encoder", lambda _: False) is None
     assert newest_run("eval") is None
+
+
+def test_a_result_is_written_after_all_else_is_on_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A power loss must not leave a finished run with half of its metrics."""
+    synced: list[str] = []
+    fsync = os.fsync
+
+    def traced(handle: int) -> None:
+        synced.append(Path(os.readlink(f"/proc/self/fd/{handle}")).name)
+        fsync(handle)
+
+    with Run.create("eval", Path("out"), SETTINGS) as run:
+        run.metric({"epoch": 1})
+        monkeypatch.setattr(os, "fsync", traced)
+        run.finish({"score": 0.5})
+    result = next(name for name in synced if name.startswith(f".{runs.RESULT}"))
+    assert {runs.METRICS, runs.EVENTS} <= set(synced[: synced.index(result)])
+
+
+def test_what_an_older_version_had_not_is_as_its_preset_says() -> None:
+    """Else no run would outlive a new setting, and the hint would lead in a circle."""
+    settings = load_settings("smoke").as_dict()
+    with Run.create("eval", Path("out"), settings):
+        pass
+    config = Path("out/config.toml")
+    lines = config.read_text().splitlines(keepends=True)
+    older = [line for line in lines if not line.startswith(("plant_spread", "bootstrap"))]
+    assert len(older) == len(lines) - 2
+    config.write_text("".join(older))
+    with Run.create("eval", Path("out"), settings) as run:
+        assert run.resumed
+    other = load_settings("smoke", flags={"protocol.bootstrap": 7}).as_dict()
+    with pytest.raises(UsageError, match=r"protocol\.bootstrap = \d+, not 7"):
+        Run.create("eval", Path("out"), other)
+    config.write_text("".join(older) + "[strange]\nnew = 1\n")
+    with pytest.raises(UsageError, match=r"strange\.new = 1, not None"):
+        Run.create("eval", Path("out"), settings)
+
+
+def test_a_run_of_schema_1_goes_on(tmp_path: Path) -> None:
+    """It did not say what it was given: nothing to compare."""
+    with Run.create("eval", Path("out"), SETTINGS):
+        pass
+    recorded = json.loads(Path("out/environment.json").read_text())
+    del recorded["schema"], recorded["inputs"]
+    Path("out/environment.json").write_text(json.dumps(recorded))
+    given = {"dataset": runs.describe_input(tmp_path, "0" * 64)}
+    with Run.create("eval", Path("out"), SETTINGS, given) as run:
+        assert run.resumed
+
+
+def test_a_damaged_run_does_not_hide_the_others() -> None:
+    for name in ("a", "b", "c"):
+        with Run.create("train-encoder", Path("runs/train-encoder") / name, SETTINGS) as run:
+            run.finish({})
+        os.utime(run.path(runs.RESULT), (ord(name), ord(name)))  # c is the newest
+    Path("runs/train-encoder/c/config.toml").write_text("= 3")
+    Path("runs/train-encoder/b/config.toml").unlink()
+    plant = lambda directory: read_config(directory)["plant"] == "desktop"  # noqa: E731
+    assert newest_run("train-encoder", plant) == Path("runs/train-encoder/a")
+    other = lambda directory: read_config(directory)["no such"]  # noqa: E731
+    assert newest_run("train-encoder", other) is None

@@ -6,6 +6,7 @@ may be computed twice after a failure.
 """
 
 import dataclasses
+import importlib.metadata
 import importlib.util
 import logging
 import multiprocessing
@@ -18,16 +19,20 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli import __version__
+from hjepa_cli.errors import ClusterLost, HjepaError, NumericalError, UsageError
+from hjepa_cli.interrupts import SIGNALS
 
 MAX_WORKERS = 8  # of some 400 MB each
 IN_FLIGHT = 4  # units submitted per worker: enough to keep it busy, few enough to stop soon
 LOCAL = "local"
 RETRIES = 3  # of a unit whose Dask worker died
 CONNECT_S = 10
+NUMBERS_FROM = ("numpy", "pymunk", "scipy", "torch")  # another version, other last digits
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -167,13 +172,14 @@ def worker_pool(
     Spawned, not forked: torch's threads do not survive a fork.
     """
     context = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())  # of the program that calls us
     pool = ProcessPoolExecutor(count, context, initializer=initializer, initargs=arguments)
     with anonymous_main():
         try:
             yield pool
         except BaseException:
-            for process in multiprocessing.active_children():
-                process.terminate()
+            for process in set(multiprocessing.active_children()) - others:
+                process.kill()
             raise
         finally:
             pool.shutdown(cancel_futures=True)
@@ -186,22 +192,25 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
     Workers of other machines must have the same version installed and see the same files.
 
     Raises:
-        UsageError: no scheduler answers at ``where``.
+        UsageError: no scheduler answers at ``where``, it has no workers, or they would compute
+            something else.
+        ClusterLost: it ends before the ``with`` block.
     """
     import distributed
 
     dask: Any = distributed  # it has no types
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # a lost worker is no news here
+    for name in ("distributed", "distributed.client"):  # a lost worker is no news here
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with anonymous_main():
         if where == LOCAL:
-            target: dict[str, Any] = {
-                "address": dask.LocalCluster(
+            with signals_blocked():
+                local = dask.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
                     dashboard_address="127.0.0.1:0",  # None is port 8787, one per machine
                     silence_logs=logging.CRITICAL,
                 )
-            }
+            target: dict[str, Any] = {"address": local}
         else:
             target = {"scheduler_file": where} if Path(where).is_file() else {"address": where}
         try:
@@ -212,13 +221,61 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
                 hint=f"hjepa ... --cluster {LOCAL}, or start one: dask scheduler",
             ) from None
         try:
+            check_cluster(client, where)
             threads = sum(client.nthreads().values())
             yield client.get_executor(retries=RETRIES, pure=False), max(threads, 1)
+        except HjepaError:
+            raise
+        except Exception:
+            if client.status == "running":
+                raise
+            raise ClusterLost(
+                f"--cluster {where}: the scheduler has gone; what is finished is kept",
+                hint="start it and its workers, then run the same command again",
+            ) from None
         finally:
             client.close()
             if where == LOCAL:
                 with suppress(TimeoutError):  # the work is done; they end with us
                     target["address"].close()
+
+
+def versions() -> dict[str, str]:
+    """What the numbers of this process depend on."""
+    return {"hjepa": __version__} | {
+        name: importlib.metadata.version(name) for name in NUMBERS_FROM
+    }
+
+
+def check_cluster(client: Any, where: str) -> None:
+    """Demand workers, and of every one the versions that are here: others give other numbers.
+
+    Raises:
+        UsageError: naming what is missing or differs.
+    """
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError:
+        raise UsageError(
+            f"--cluster {where}: the scheduler has no workers",
+            hint="dask worker --nthreads 1 with the scheduler's address or --scheduler-file FILE",
+        ) from None
+    here = versions()
+    try:
+        found: dict[str, dict[str, str]] = client.run(versions)
+    except Exception as error:  # whatever unpickling there raises
+        raise UsageError(
+            f"--cluster {where}: a worker cannot import hjepa: {error}",
+            hint=f"pip install hjepa=={here['hjepa']} where workers and scheduler run",
+        ) from None
+    for worker, there in found.items():
+        differing = [name for name in here if there.get(name) != here[name]]
+        if differing:
+            shown = ", ".join(f"{name} {there.get(name)}, not {here[name]}" for name in differing)
+            raise UsageError(
+                f"--cluster {where}: worker {worker} has {shown}",
+                hint="install the same versions everywhere: pip freeze tells those that are here",
+            )
 
 
 @contextmanager
@@ -238,9 +295,24 @@ def anonymous_main() -> Iterator[None]:
             main["__file__"] = file
 
 
+@contextmanager
+def signals_blocked() -> Iterator[None]:
+    """Keep Ctrl-C and SIGTERM from threads and processes that are started here, for good.
+
+    They inherit the mask; in this thread a signal waits until the ``with`` block ends.
+    """
+    resource_tracker.ensure_running()  # its start would unblock them in the thread it happens in
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def prepare_worker() -> None:
-    """Ctrl-C is the parent's; a worker ends when the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ctrl-C and SIGTERM, which reach the whole group, are the parent's; a worker ends with it."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -15,6 +15,7 @@ from hjepa_cli.settings import ActorSettings
 
 WARM_UP = 0.3  # share of a one-cycle schedule spent rising
 NAMED = 20  # samples of a batch in a message
+MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
 
 
 def resolve_device(name: str) -> torch.device:
@@ -140,12 +141,16 @@ class Optimiser:
         """
         for key, value in state.items():
             number, _, name = key.partition(".")
-            parameter = self.parameters[int(number)] if int(number) < len(self.parameters) else None
-            if parameter is None or value.shape not in ((), parameter.shape):
+            known = number.isdecimal() and int(number) < len(self.parameters) and name in MOMENTS
+            parameter = self.parameters[int(number)] if known else None
+            shape = () if name == "step" or parameter is None else parameter.shape
+            if parameter is None or value.shape != shape or (name == "step" and value < 1):
                 raise ValueError(f"optimiser state {key} of shape {tuple(value.shape)}")
             if value.dim():  # in the parameter's memory layout, or the last bits come out otherwise
                 value = torch.empty_like(parameter).copy_(value)
             self.inner.state[parameter][name] = value
+        if any(kept and len(kept) < len(MOMENTS) for kept in self.inner.state.values()):
+            raise ValueError("optimiser state is incomplete")
 
 
 def name_samples(kind: str, indices: Tensor) -> str:

@@ -39,10 +39,12 @@ def open_workers(settings: Settings, model_path: Path | None, count: int) -> Ite
     done: Synchronized[int] = multiprocessing.get_context("spawn").Value("q", 0)
 
     def follow(futures: Sequence[Future[Outcome]], blocks: Sequence[Block], tick: Tick) -> None:
-        waiting, told = set(futures), done.value
+        # Read without the lock: a worker that is killed holding it would never give it back.
+        waiting, count = set(futures), done.get_obj()
+        told = count.value
         while waiting:
             waiting = wait(waiting, TICK_S).not_done
-            now = done.value
+            now = count.value
             tick(now - told)
             told = now
 

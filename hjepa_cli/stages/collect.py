@@ -5,26 +5,29 @@ Settings → dataset directory. Frames are stored only with ``--frames stored``,
 report how fast that goes on this machine.
 """
 
+import contextlib
 import dataclasses
 import functools
 import math
 import shlex
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hjepa_cli.checks import check_settings
 from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.core.payload import raw_frame_bits
 from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.core.system import Camera
 from hjepa_cli.core.trajectories import generate, split_sizes
-from hjepa_cli.errors import Interrupted, StorageError, UsageError
+from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.interrupts import exit_code
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
+from hjepa_cli.settings import Settings, dotted, load_settings
 from hjepa_cli.storage.datasets import (
     MANIFEST,
     Dataset,
@@ -36,11 +39,21 @@ from hjepa_cli.storage.datasets import (
     write_shard,
 )
 from hjepa_cli.storage.files import check_free_space, point_to
-from hjepa_cli.storage.shards import Described, Shard, ShardLog, cut
+from hjepa_cli.storage.shards import (
+    LOG,
+    NAME,
+    Described,
+    Shard,
+    ShardLog,
+    cut,
+    read_task,
+    remove_log,
+)
 
 FRAMES_PER_SAMPLE = 2  # κ: current and previous
 TOGETHER = 20  # trajectories rendered at a time; the sample is one such batch
 WORTH_WORKERS = 4_000_000  # simulated steps; below, processes cost more than they bring
+MAX_SHARDS = 50_000  # which make a dataset.json of 10 MB; readers take 16
 
 
 def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[str, Any]:
@@ -69,33 +82,27 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     }
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
+            remove_log(directory)  # a kill between the two has left it behind
             data = load_dataset(directory, settings.plant)
             changed = "" if data.settings == definition else ", made with other settings"
             screen.say(f"{directory} holds a finished dataset{changed}; it is left as it is")
             return describe(data, time.perf_counter() - started, frames_per_s=None)
 
-        check_free_space(directory, size_bytes(settings))
-        frames_per_s = rate(camera, settings)
-        log = ShardLog(directory, settings.as_dict())
-        try:
-            shards = make_shards(settings, directory.absolute(), log, screen)
-        except KeyboardInterrupt as error:
-            raise Interrupted(
-                "interrupted; finished shards are kept",
-                hint=continue_command(directory),
-                code=exit_code(error),
-            ) from None
-        except StorageError as error:
-            point_to(continue_command(directory), error)
-            raise
-        data = write_manifest(
-            directory,
-            settings=definition,
-            shards=shards,
-            plant_name=settings.plant,
-            camera_manifest=camera.manifest(),
-        )
-        log.remove()
+        check_same(directory, settings)
+        shards_there = (path for path in directory.iterdir() if NAME.fullmatch(path.name))
+        there_bytes = sum(path.stat().st_size for path in shards_there)
+        check_free_space(directory, size_bytes(settings) - there_bytes)
+        with telling_how_to_go_on(directory):
+            log = ShardLog(directory, settings.as_dict())
+            frames_per_s = rate(camera, settings)
+            data = write_manifest(
+                directory,
+                settings=definition,
+                shards=make_shards(settings, directory.absolute(), log, screen),
+                plant_name=settings.plant,
+                camera_manifest=camera.manifest(),
+            )
+            remove_log(directory)
     result = describe(data, time.perf_counter() - started, frames_per_s)
     bits = raw_frame_bits(FRAMES_PER_SAMPLE, HEIGHT_PX, WIDTH_PX)
     screen.say(
@@ -104,6 +111,67 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
         f"uplink ({bits} bits a step)"
     )
     return result
+
+
+@contextlib.contextmanager
+def telling_how_to_go_on(directory: Path) -> Iterator[None]:
+    """From the first byte to the last: nothing finished is lost, and the message says so."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise Interrupted(
+            "interrupted; finished shards are kept",
+            hint=continue_command(directory),
+            code=exit_code(error),
+        ) from None
+    except HjepaError as error:
+        point_to(continue_command(directory), error)
+        raise
+
+
+def check_same(directory: Path, settings: Settings) -> None:
+    """Refuse to go on with other settings than those that a collection was begun with.
+
+    Raises:
+        UsageError: naming them.
+    """
+    if not (directory / LOG).exists():
+        return
+    before, now = (
+        dotted(given.as_dict() | {"preset": None})
+        for given in (recorded_settings(directory), settings)
+    )
+    changed = [
+        f"{key} = {before.get(key)!r}, not {now.get(key)!r}"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key)
+    ]
+    if changed:
+        raise UsageError(
+            f"{directory} holds an unfinished dataset with other settings: {'; '.join(changed)}",
+            hint=f"{continue_command(directory)} continues it; or choose another --out DIR",
+        )
+
+
+def recorded_settings(directory: Path) -> Settings:
+    """What is being collected in ``directory``; settings that its version had not, by its preset.
+
+    Raises:
+        DataError: the log is damaged, or of a version with other settings.
+    """
+    task = read_task(directory)
+    preset = task.pop("preset", None)
+    if preset is not None and not isinstance(preset, str):
+        raise DataError(f"{directory} is of preset {preset!r}")
+    try:
+        settings = load_settings(preset, None, dotted(task))
+        check_settings(settings)
+    except UsageError as error:
+        raise DataError(
+            f"{directory / LOG} was not written by this version: {error.message}",
+            hint=f"delete {directory} to collect again, or choose another --out DIR",
+        ) from None
+    return settings
 
 
 def check(settings: Settings) -> None:
@@ -128,6 +196,13 @@ def check(settings: Settings) -> None:
     ):
         if value < least:
             raise UsageError(f"{name} = {value}; expected at least {least}")
+    total = sum(count for count, _ in split_sizes(settings).values())
+    most = MAX_SHARDS * per_shard(options.frames == "stored")
+    if total > most:
+        raise UsageError(
+            f"{total} trajectories; one dataset holds at most {most}",
+            hint="collect several, each with its own --seed and --out DIR",
+        )
 
 
 def make_shards(
@@ -137,7 +212,7 @@ def make_shards(
     stored = settings.collect.frames == "stored"
     sizes = {name: count for name, (count, _) in split_sizes(settings).items()}
     shards = cut(sizes, per_shard(stored))
-    left = [shard for shard in shards if shard.name not in log.done]
+    left = [shard for shard in shards if not is_done(shard, settings, log)]
     done = sum(sizes.values()) - sum(shard.stop - shard.start for shard in left)
     screen.say(
         f"collecting {settings.plant} trajectories into {directory.name}: "
@@ -153,6 +228,18 @@ def make_shards(
             log.add(described)
             bar.advance(described["trajectories"])
     return [log.done[shard.name] for shard in shards]
+
+
+def is_done(shard: Shard, settings: Settings, log: ShardLog) -> bool:
+    """Its file is intact, and described as ours would be."""
+    expected = {
+        "split": shard.split,
+        "trajectories": shard.stop - shard.start,
+        "steps": split_sizes(settings)[shard.split][1],
+        "stored": settings.collect.frames == "stored",
+    }
+    described = log.done.get(shard.name, {})
+    return all(described.get(key) == value for key, value in expected.items())
 
 
 def make_shard(settings: Settings, directory: Path, shard: Shard) -> Described:

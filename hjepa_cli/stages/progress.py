@@ -26,6 +26,11 @@ from hjepa_cli.storage.runs import Run
 PROGRESS_FILE = "progress.safetensors"
 SAVE_EVERY_S = 60.0
 TORCH_STREAM = "torch-stream"  # the state of torch's own generator, among the tensors
+METRICS_ROWS = "metrics-rows"  # the text of metrics.csv, likewise: it may outgrow a header
+MOST_THREADS = 4096
+
+# What restoring a state raises that does not fit.
+_MISFIT = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 
 
 class Part(Protocol):
@@ -45,7 +50,6 @@ class Saved:
         step: steps done in it.
         finished: loops before it, all done.
         stream: state of the loop's numpy generator.
-        metrics: ``metrics.csv`` at this step.
         threads: threads that torch computes with; sums differ in the last bit with others.
         seconds: spent on the run so far.
     """
@@ -54,7 +58,6 @@ class Saved:
     step: int
     finished: list[str]
     stream: dict[str, Any]
-    metrics: str
     threads: int
     seconds: float
 
@@ -125,7 +128,11 @@ class Progress:
         if self._saved and phase in self._saved.finished:
             return
         start = self.reached(phase)
-        if self._tensors and self._saved and self._saved.phase == phase:
+        if start > total:
+            raise self._misfit(f"step {start} of {total}")
+        if self._tensors and self._saved:
+            if self._saved.phase != phase:
+                raise self._misfit(f"saved in '{self._saved.phase}', which is not '{phase}'")
             self._restore(parts, stream)
         saved_s = time.monotonic()
         with self._interrupts.postpone() as stopped:
@@ -171,12 +178,12 @@ class Progress:
             for name, tensor in state.state_dict().items()
         }
         tensors[TORCH_STREAM] = torch.get_rng_state().numpy()
+        tensors[METRICS_ROWS] = np.array(bytearray(self._record.metrics.encode()), np.uint8)
         saved = Saved(
             phase=phase,
             step=step,
             finished=self._finished,
             stream=_plain(stream.bit_generator.state),
-            metrics=self._record.metrics,
             threads=torch.get_num_threads(),
             seconds=round(self.seconds, 2),
         )
@@ -189,15 +196,21 @@ class Progress:
             screen.say(f"{self._record.directory} was interrupted before its first save")
             return
         checkpoint = load_checkpoint(self._path)
-        try:
-            saved = Saved(**checkpoint.metadata)
-        except TypeError as error:
-            raise self._misfit(error) from None
-        self._saved, self._finished = saved, list(saved.finished)
+        metadata = dict(checkpoint.metadata)
+        rows = metadata.pop("metrics", None)  # where they were at first
         self._tensors = {
             name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()
         }
-        self._restore_metrics(saved.metrics)
+        try:
+            saved = _saved(metadata)
+            if rows is None:
+                rows = self._tensors.pop(METRICS_ROWS).numpy().tobytes().decode()
+            if not isinstance(rows, str):
+                raise TypeError("malformed metrics")
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._misfit(error) from None
+        self._saved, self._finished = saved, list(saved.finished)
+        self._restore_metrics(rows)
         if saved.threads != torch.get_num_threads():
             torch.set_num_threads(saved.threads)
         screen.say(f"{self._record.directory}: {saved.phase} goes on after step {saved.step}")
@@ -217,7 +230,7 @@ class Progress:
                 state.load_state_dict(
                     {name.removeprefix(prefix): self._tensors.pop(name) for name in own}
                 )
-        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        except _MISFIT as error:
             raise self._misfit(error) from None
         if self._tensors:
             raise self._misfit(f"unexpected {min(self._tensors)}")
@@ -228,6 +241,25 @@ class Progress:
             f"{self._path} does not fit this run: {line}",
             hint=f"delete it to train from the start: rm {self._path}",
         )
+
+
+def _saved(metadata: dict[str, Any]) -> Saved:
+    """What a file says, its types checked. Raises TypeError."""
+    saved = Saved(**metadata)
+    good = (
+        isinstance(saved.phase, str)
+        and type(saved.step) is int
+        and saved.step >= 0
+        and isinstance(saved.finished, list)
+        and all(isinstance(phase, str) for phase in saved.finished)
+        and isinstance(saved.stream, dict)
+        and type(saved.threads) is int
+        and 0 < saved.threads <= MOST_THREADS
+        and type(saved.seconds) in (int, float)
+    )
+    if not good:
+        raise TypeError("malformed fields")
+    return saved
 
 
 def _plain(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
 from hjepa_cli.storage.datasets import MANIFEST, load_dataset
 from hjepa_cli.storage.runs import CONFIG, read_environment
-from hjepa_cli.storage.shards import LOG, read_task
+from hjepa_cli.storage.shards import LOG, read_task, remove_log
 
 
 def run(directory: Path, screen: Screen) -> dict[str, Any]:
@@ -87,6 +87,7 @@ def _collect(directory: Path, screen: Screen) -> dict[str, Any]:
     from hjepa_cli.stages import collect
 
     if (directory / MANIFEST).exists():
+        remove_log(directory)  # a kill between the two has left it behind
         screen.say(f"{directory} holds a finished dataset")
         return collect.describe(load_dataset(directory), 0.0, None)
     task = read_task(directory)

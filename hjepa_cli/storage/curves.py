@@ -66,17 +66,27 @@ class Digest:
             settings: plant, seed, protocol, embedding and clean rollouts count.
             dataset: settings of the dataset whose clean rollouts are used, if any. One that was
                 collected as the settings say gives the same rollouts, and the same digest.
+
+        Raises:
+            DataError: the dataset does not say how its clean rollouts were made.
         """
         values = settings.as_dict()
         source = values if dataset is None else dataset
-        collected = source["collect"]
-        start = collected.get("start", [])
+        try:
+            collected = source["collect"]
+            clean = [source["seed"], *(collected[key] for key in _CLEAN)]
+            clean += collected.get("start", [])
+        except (LookupError, TypeError, AttributeError):
+            raise DataError(
+                "the dataset does not say how its clean rollouts were made",
+                hint="leave --dataset out: they are made again",
+            ) from None
         measured = {
             "plant": values["plant"],
             "seed": values["seed"],
             "protocol": values["protocol"],
             "embedding": values["encoder"]["embedding"],
-            "clean": [source["seed"], *(collected[key] for key in _CLEAN), *start],
+            "clean": clean,
         }
         changed = {
             key: value for key, value in values["conditions"].items() if value != NOMINAL[key]
@@ -148,12 +158,13 @@ def write(path: Path, digest: Digest, entries: Mapping[str, Entry]) -> None:
     Raises:
         StorageError: the disk refused; the file is what it was before.
     """
-    kept: dict[str, Entry] = {}
-    with contextlib.suppress(DataError):  # damaged curves are replaced like foreign ones
-        kept = read(path, digest)
-    methods = files.jsonable(kept | dict(entries))
-    document = {"schema": SCHEMA, "digest": dataclasses.asdict(digest), "methods": methods}
-    files.write_json(path, document)
+    with files.taking_turns(path.parent):  # two evaluations may share a model's file
+        kept: dict[str, Entry] = {}
+        with contextlib.suppress(DataError):  # damaged curves are replaced like foreign ones
+            kept = read(path, digest)
+        methods = files.jsonable(kept | dict(entries))
+        document = {"schema": SCHEMA, "digest": dataclasses.asdict(digest), "methods": methods}
+        files.write_json(path, document)
 
 
 def _newest_first(*stages: Path) -> list[Path]:

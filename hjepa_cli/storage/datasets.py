@@ -7,6 +7,7 @@ dataset only when it is complete. No time, host or path is stored: equal inputs,
 import contextlib
 import dataclasses
 import hashlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,13 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.core.plant import plant
-from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError
+from hjepa_cli.errors import (
+    DataError,
+    HjepaError,
+    MissingInputError,
+    NumericalError,
+    UsageError,
+)
 from hjepa_cli.storage import files
 from hjepa_cli.storage import tensors as arrays
 from hjepa_cli.storage.shards import LOG, Described, Shard, cut
@@ -95,14 +102,18 @@ class Dataset:
 
     def _read_shard(self, shard: Mapping[str, Any], steps: int) -> dict[str, np.ndarray]:
         path = self.path / shard["name"]
-        data = files.read_bytes(path)
+        stored = self.frames == "stored"
+        expected = _expected(shard["trajectories"], steps, stored, path, self.plant)
+        data = files.read_bytes(path, limit=_largest_bytes(expected))
         if hashlib.sha256(data).hexdigest() != shard["sha256"]:
             raise DataError(
                 f"{path} was changed or truncated after it was written: its sha256 does not match",
                 hint="collect the dataset again: hjepa collect",
             )
         tensors, _ = arrays.unpack(data, path)
-        _check(tensors, shard["trajectories"], steps, self.frames == "stored", path, self.plant)
+        _check(tensors, expected, path)
+        if bad := _not_finite(tensors):
+            raise DataError(f"{path}: '{bad}' holds NaN or an infinity")
         return tensors
 
 
@@ -124,7 +135,8 @@ def write_dataset(
         camera_manifest: the renderer's version, colours and sizes.
 
     Raises:
-        DataError: wrong shapes or dtypes, or values that are not finite.
+        DataError: wrong shapes or dtypes.
+        NumericalError: values that are not finite; they are not written.
         UsageError: there is a dataset in ``directory`` already.
         StorageError: the disk refused; no dataset is left behind.
     """
@@ -133,7 +145,9 @@ def write_dataset(
     _remove_shards(directory)
     stored = any(split.frames is not None for split in splits.values())
     for name, split in splits.items():
-        _check(split.tensors(), len(split), split.steps, stored, directory / name, plant_name)
+        where = directory / name
+        expected = _expected(len(split), split.steps, stored, where, plant_name)
+        _check(split.tensors(), expected, where)
     done = [
         write_shard(directory, shard, splits[shard.split][shard.start : shard.stop], plant_name)
         for shard in cut({name: len(split) for name, split in splits.items()}, per_shard(stored))
@@ -153,12 +167,21 @@ def write_shard(
     """Write one shard and return how the manifest will describe it.
 
     Raises:
-        DataError: wrong shapes or dtypes, or values that are not finite.
+        DataError: wrong shapes or dtypes.
+        NumericalError: values that are not finite; they are not written.
         StorageError: the disk refused.
     """
     stored = trajectories.frames is not None
     path = directory / shard.name
-    _check(trajectories.tensors(), len(trajectories), trajectories.steps, stored, path, plant_name)
+    expected = _expected(len(trajectories), trajectories.steps, stored, path, plant_name)
+    _check(trajectories.tensors(), expected, path)
+    if bad := _not_finite(trajectories.tensors()):
+        row, index, *_ = np.argwhere(~np.isfinite(trajectories.tensors()[bad]))[0]
+        raise NumericalError(
+            f"trajectory {shard.start + row} of split '{shard.split}': '{bad}' is not finite from "
+            f"index {index} on",
+            hint="--config FILE.toml with smaller forces or starts in [collect]",
+        )
     data = arrays.pack(trajectories.tensors())
     files.write_bytes(path, data)
     return {
@@ -287,19 +310,18 @@ def per_shard(stored: bool) -> int:
     return SHARD_TRAJECTORIES_WITH_FRAMES if stored else SHARD_TRAJECTORIES
 
 
-def _check(
-    tensors: Mapping[str, np.ndarray],
-    count: int,
-    steps: int,
-    stored: bool,
-    where: Path,
-    plant_name: str,
-) -> None:
-    """Demand the shapes of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
+Shapes = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Names of tensors with dtype and shape."""
+
+
+def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str) -> Shapes:
+    """The tensors of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
     try:
         kind = plant(plant_name)
     except UsageError as error:
         raise DataError(f"{where}: {error.message}") from None
+    if count < 1 or steps < 1:
+        raise DataError(f"{where} holds {count} trajectories of {steps} steps; at least 1 of each")
     forces = (count, steps, *kind.action_shape)
     expected: dict[str, tuple[str, tuple[int, ...]]] = {
         "states": ("float32", (count, steps + 1, len(kind.state_names))),
@@ -308,8 +330,17 @@ def _check(
     }
     if stored:
         expected["frames"] = ("uint8", (count, steps + 1, *FRAME_SHAPE))
-    if count < 1 or steps < 1:
-        raise DataError(f"{where} holds {count} trajectories of {steps} steps; at least 1 of each")
+    return expected
+
+
+def _largest_bytes(expected: Shapes) -> int:
+    """What a shard may take on disk; more is not even read."""
+    values = sum(np.dtype(name).itemsize * math.prod(shape) for name, shape in expected.values())
+    return values + arrays.HEADER_LIMIT_BYTES + 8
+
+
+def _check(tensors: Mapping[str, np.ndarray], expected: Shapes, where: Path) -> None:
+    """Demand these tensors and no others."""
     if tensors.keys() != expected.keys():
         raise DataError(f"{where} holds {sorted(tensors)}; expected {sorted(expected)}")
     for name, (dtype, shape) in expected.items():
@@ -318,8 +349,10 @@ def _check(
             raise DataError(
                 f"{where}: '{name}' is {array.dtype.name} {array.shape}; expected {dtype} {shape}"
             )
-    if bad := arrays.non_finite({key: tensors[key] for key in tensors if key != "frames"}):
-        raise DataError(f"{where}: '{bad}' holds NaN or an infinity")
+
+
+def _not_finite(tensors: Mapping[str, np.ndarray]) -> str | None:
+    return arrays.non_finite({key: tensors[key] for key in tensors if key != "frames"})
 
 
 def _check_manifest(manifest: Mapping[str, Any], path: Path) -> None:
@@ -328,6 +361,7 @@ def _check_manifest(manifest: Mapping[str, Any], path: Path) -> None:
         good = (
             isinstance(manifest["plant"], str)
             and isinstance(manifest["config"], dict)
+            and isinstance(manifest["config"].get("collect", {}), dict)
             and isinstance(manifest["camera"], dict)
             and manifest["frames"] in ("stored", "rendered")
             and 0 < len(manifest["splits"].keys() & set(SPLITS)) == len(manifest["splits"])
@@ -337,6 +371,8 @@ def _check_manifest(manifest: Mapping[str, Any], path: Path) -> None:
                 and all(SHARD_NAME.fullmatch(shard["name"]) for shard in split["shards"])
                 and all(type(shard["trajectories"]) is int for shard in split["shards"])
                 and all(isinstance(shard["sha256"], str) for shard in split["shards"])
+                and split["trajectories"] == sum(n["trajectories"] for n in split["shards"])
+                and type(split["trajectories"]) is int
                 for split in manifest["splits"].values()
             )
         )

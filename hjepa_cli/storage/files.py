@@ -8,23 +8,33 @@ helpers serve run directories and datasets.
 import contextlib
 import errno
 import fcntl
+import io
 import json
 import math
 import os
+import platform
 import re
+import secrets
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from hjepa_cli.errors import DataError, LockedError, MissingInputError, StorageError
+from hjepa_cli.errors import (
+    DataError,
+    HjepaError,
+    LockedError,
+    MissingInputError,
+    StorageError,
+)
 
 LOCK_FILE = ".lock"
 JSON_LIMIT_BYTES = 16 * 2**20
 
-_TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp")  # .<name>.<pid>.tmp
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp")  # .<name>.<random>.<pid>.tmp
+_HOLDER = re.compile(rb"process \d{1,20} on [\w.-]{1,64}")
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_FREE_SPACE = "free some disk space, then "
+_AGAIN = "run the same command again"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -33,7 +43,9 @@ def write_bytes(path: Path, data: bytes) -> None:
     Raises:
         StorageError: the disk refused; ``path`` is what it was before.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # Workers in containers have equal pids, and two may write the same shard at the same time.
+    unique = f"{secrets.token_hex(4)}.{os.getpid()}"
+    temporary = path.with_name(f".{path.name}.{unique}.tmp")
     try:
         with open(temporary, "wb") as file:
             file.write(data)
@@ -125,6 +137,18 @@ def read_bytes(path: Path, *, limit: int | None = None) -> bytes:
         raise StorageError(f"cannot read {path}: {error.strerror or error}") from None
 
 
+def make_durable(path: Path) -> None:
+    """Flush to the disk what was appended to ``path``, if it is there. Raises StorageError."""
+    try:
+        with open(path, "rb") as file:
+            os.fsync(file.fileno())
+        _sync_directory(path.parent)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise storage_error(path, error) from None
+
+
 def jsonable(value: Any) -> Any:
     """Return ``value`` as plain JSON data: numpy becomes lists, undefined numbers become null."""
     if isinstance(value, Mapping):
@@ -172,35 +196,73 @@ def list_names(directory: Path) -> list[str]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        raise storage_error(directory, error) from None
+        raise StorageError(f"cannot read {directory}: {error.strerror or error}") from None
+
+
+class _Lock(io.FileIO):
+    """A lock file that says who holds it, and nothing any more once it is given back.
+
+    What a directory holds in the end must not depend on who made it.
+    """
+
+    held = False
+
+    def close(self) -> None:
+        if self.held and not self.closed:
+            with contextlib.suppress(OSError):
+                self.truncate(0)
+        super().close()
 
 
 def lock_directory(directory: Path) -> IO[bytes]:
     """Take ``directory`` for this process alone, until the returned file is closed.
 
-    Also proves that the directory is writable and sweeps temporaries of processes that died.
+    Also proves that the directory is writable and sweeps temporaries of processes that died. The
+    lock is the kernel's and ends with its holder; the text in the file is for people.
 
     Raises:
         LockedError: another process holds it.
         StorageError: not writable.
     """
     try:
-        file = open(directory / LOCK_FILE, "ab")
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW  # never write to where a link leads
+        file = _Lock(os.open(directory / LOCK_FILE, flags, 0o666), "r+")
     except OSError as error:
         raise storage_error(directory, error) from None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
+        found = _HOLDER.fullmatch(file.read(100) or b"")
         file.close()
         raise LockedError(
-            f"another process is working in {directory}",
+            f"another process is working in {directory}"
+            + (f": {found[0].decode()}" if found else ""),
             hint="wait until it has ended, or choose another place with --out DIR",
         ) from None
     except OSError as error:
         file.close()
         raise storage_error(directory, error) from None
+    file.held = True
+    with contextlib.suppress(OSError):  # a full disk does not unlock the directory
+        file.truncate(0)  # what a killed holder has left
+        file.write(f"process {os.getpid()} on {platform.node()}".encode())
     sweep_temporaries(directory)
     return file
+
+
+@contextlib.contextmanager
+def taking_turns(directory: Path) -> Iterator[None]:
+    """Let one process after the other add to a file in ``directory``. Raises StorageError."""
+    try:
+        handle = os.open(directory, os.O_RDONLY)
+    except OSError as error:
+        raise storage_error(directory, error) from None
+    try:
+        with contextlib.suppress(OSError):  # some network disks lock no directories
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def sweep_temporaries(directory: Path) -> None:
@@ -220,7 +282,7 @@ def is_temporary(name: str) -> bool:
 def storage_error(path: Path, error: OSError) -> StorageError:
     """Turn an OSError on ``path`` into one line with the next step."""
     if error.errno in _NO_SPACE:
-        hint = _FREE_SPACE + "run the same command again"
+        hint = f"free some disk space, then {_AGAIN}"
     else:
         hint = "choose a directory that you may write to with --out DIR"
     return StorageError(f"cannot write {path}: {error.strerror or error}", hint=hint)
@@ -231,15 +293,17 @@ def check_free_space(directory: Path, size_bytes: int) -> None:
     free_bytes = shutil.disk_usage(directory).free
     if free_bytes < size_bytes:
         raise StorageError(
-            f"{directory} has {free_bytes / 1e9:.1f} GB free; {size_bytes / 1e9:.1f} GB are needed",
+            f"{directory} has {free_bytes / 1e6:,.1f} MB free; {size_bytes / 1e6:,.1f} are needed",
             hint="free some disk space, or choose another disk with --out DIR",
         )
 
 
 def point_to(command: str, error: BaseException | None) -> None:
-    """Let the hint of a full disk name the command that goes on."""
-    if isinstance(error, StorageError) and (error.hint or "").startswith(_FREE_SPACE):
-        error.hint = _FREE_SPACE + command
+    """Let a hint to repeat the command name the one that goes on: without --out, the same one
+    begins again in a new directory.
+    """
+    if isinstance(error, HjepaError) and (error.hint or "").endswith(_AGAIN):
+        error.hint = f"{(error.hint or '').removesuffix(_AGAIN)}{command}"
 
 
 def _writing(pid: int) -> bool:

@@ -5,6 +5,7 @@
 ``events.jsonl`` (timings), the checkpoints of the stage, and ``result.json`` once it is finished.
 """
 
+import contextlib
 import csv
 import importlib.metadata
 import io
@@ -86,7 +87,7 @@ class Run:
         else:
             directory = out
             files.make_directory(directory)
-            _refuse_foreign(directory, stage)
+            _refuse_foreign(directory)
         run = cls(directory, files.lock_directory(directory))
         run._track = track(directory) if track else None
         try:
@@ -141,6 +142,8 @@ class Run:
 
     def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
         """Write ``result.json``, which makes the run a finished one, and return what it holds."""
+        for name in (METRICS, EVENTS):  # appended to: a power loss must not leave a result alone
+            files.make_durable(self.path(name))
         self.result = files.jsonable(result)
         files.write_json(self.path(RESULT), self.result)
         return self.result
@@ -172,10 +175,16 @@ class Run:
     def _open(self, stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
         if self.path(CONFIG).exists():
             self.resumed = True
+            recorded = read_environment(self.directory)
+            if recorded["stage"] != stage:
+                raise UsageError(
+                    f"{self.directory} holds a run of '{recorded['stage']}', not of '{stage}'",
+                    hint="choose another directory with --out DIR",
+                )
             finished = self.path(RESULT).exists()
-            differences = _differences(read_config(self.directory), settings)
-            recorded = read_environment(self.directory)["inputs"]
-            differences += _differences(_digests(recorded), _digests(inputs))
+            differences = _differences(_settings(self.directory, recorded), settings)
+            if recorded["schema"] > 1:
+                differences += _differences(_digests(recorded["inputs"]), _digests(inputs))
             if differences:
                 raise UsageError(
                     f"{self.directory} holds {'a finished' if finished else 'an unfinished'} run "
@@ -215,8 +224,15 @@ class Run:
 def newest_run(
     stage: str, predicate: Callable[[Path], bool] = lambda directory: True, root: Path = ROOT
 ) -> Path | None:
-    """Return the most recently finished ``runs/<stage>/*`` that satisfies ``predicate``, if any."""
-    return next(filter(predicate, finished_runs(stage, root=root)), None)
+    """Return the most recently finished ``runs/<stage>/*`` that satisfies ``predicate``, if any.
+
+    Runs whose records are damaged or of another version do not.
+    """
+    for directory in finished_runs(stage, root=root):
+        with contextlib.suppress(DataError, MissingInputError, LookupError, TypeError):
+            if predicate(directory):
+                return directory
+    return None
 
 
 def finished_runs(*stages: str, root: Path = ROOT) -> list[Path]:
@@ -244,7 +260,7 @@ def read_config(directory: Path) -> dict[str, Any]:
 
 
 def read_environment(directory: Path) -> dict[str, Any]:
-    """Return what :func:`environment` recorded of a run; ``inputs`` is empty for older runs.
+    """Return what :func:`environment` recorded of a run; of schema 1, with no inputs.
 
     Raises:
         MissingInputError: not a run directory.
@@ -254,9 +270,10 @@ def read_environment(directory: Path) -> dict[str, Any]:
     if not path.exists():
         raise MissingInputError(f"{directory} is not a run directory: no {ENVIRONMENT}")
     recorded = {"schema": 1, **files.read_json(path)}
-    if recorded["schema"] == 1:
-        recorded |= {"schema": SCHEMA, "inputs": {}}
-    files.check_schema(recorded["schema"], SCHEMA, f"run {directory}")
+    if type(recorded["schema"]) is int and recorded["schema"] == 1:
+        recorded["inputs"] = {}
+    else:
+        files.check_schema(recorded["schema"], SCHEMA, f"run {directory}")
     if not isinstance(recorded.get("stage"), str) or not isinstance(recorded.get("inputs"), dict):
         raise DataError(f"{path} lacks fields or has malformed ones")
     return recorded
@@ -307,22 +324,24 @@ def environment(
     }
 
 
-def _refuse_foreign(directory: Path, stage: str) -> None:
+def _refuse_foreign(directory: Path) -> None:
     entries = files.list_names(directory)
-    if CONFIG in entries:
-        other = read_environment(directory)["stage"]
-        if other != stage:
-            raise UsageError(
-                f"{directory} holds a run of '{other}', not of '{stage}'",
-                hint="choose another directory with --out DIR",
-            )
-        return
-    for name in entries:
+    for name in entries if CONFIG not in entries else ():
         if name not in (files.LOCK_FILE, ENVIRONMENT) and not files.is_temporary(name):
             raise UsageError(
                 f"{directory} is not empty and not an hjepa run: it holds '{name}'",
                 hint="choose a new or empty directory with --out DIR",
             )
+
+
+def _settings(directory: Path, recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a run, complete: what its version had not is as its preset says."""
+    values, preset = read_config(directory), recorded.get("preset")
+    try:
+        known = preset if isinstance(preset, str) else None
+        return load_settings(known, directory / CONFIG).as_dict()
+    except UsageError:  # it has settings that this version has not: they are differences
+        return values
 
 
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:

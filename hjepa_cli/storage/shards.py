@@ -13,10 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import DataError, HjepaError, UsageError
+from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.storage import files
 
 LOG = "collecting.jsonl"
+SCHEMA = 1  # of its first line; none was written there at first, which is 1 too
 NAME = re.compile(r"shard-\d{5,9}\.safetensors")
 
 Described = dict[str, Any]
@@ -52,28 +53,26 @@ class ShardLog:
 
     Args:
         directory: locked for this process.
-        task: what is collected; plain JSON data.
+        task: what is collected, plain JSON data; a log that is there keeps its own: see
+            :func:`read_task`.
 
     Attributes:
         done: finished shards by name, as :meth:`add` was told; their files are intact.
 
     Raises:
-        UsageError: something else is being collected there.
+        DataError: the log is damaged, or of a newer schema.
+        StorageError: the disk refused.
     """
 
     def __init__(self, directory: Path, task: Mapping[str, Any]) -> None:
         self._path = directory / LOG
         self.done: dict[str, Described] = {}
-        if not self._path.exists():
-            self._write_line(dict(task))
+        if not self._path.exists():  # written at once: it never lacks its first line
+            files.write_bytes(self._path, _line({"schema": SCHEMA, **task}))
             return
-        if read_task(directory) != dict(task):
-            raise UsageError(
-                f"{directory} holds an unfinished dataset with other settings",
-                hint=f"hjepa resume {directory} continues it; or choose another --out DIR",
-            )
-        lines = self._path.read_bytes().split(b"\n")[1:-1]  # a kill may have cut the last one
-        for line in lines:
+        read_task(directory)
+        first, *lines = files.read_bytes(self._path).split(b"\n")
+        for line in lines[:-1]:  # a kill may have cut the last one
             try:
                 described = files.parse_json(line)
                 name, digest = described["name"], described["sha256"]
@@ -81,36 +80,50 @@ class ShardLog:
                     self.done[described["name"]] = described
             except (ValueError, KeyError, TypeError, HjepaError):
                 continue  # collected again
-        files.write_bytes(self._path, self._path.read_bytes().split(b"\n")[0] + b"\n")
-        for described in self.done.values():
-            self._write_line(described)
+        files.write_bytes(self._path, first + b"\n" + b"".join(map(_line, self.done.values())))
 
     def add(self, described: Described) -> None:
         """Record a finished shard: ``name``, ``sha256`` and whatever else the manifest needs."""
-        self._write_line(described)
-        self.done[described["name"]] = described
-
-    def remove(self) -> None:
-        """The dataset is complete."""
-        self._path.unlink(missing_ok=True)
-
-    def _write_line(self, value: Described) -> None:
         try:
             with open(self._path, "ab") as file:
-                file.write(files.canonical_json(value).encode() + b"\n")
+                file.write(_line(described))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
             raise files.storage_error(self._path, error) from None
+        self.done[described["name"]] = described
+
+
+def remove_log(directory: Path) -> None:
+    """The dataset is complete, if it was not so before. Raises StorageError."""
+    path = directory / LOG
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise files.storage_error(path, error) from None
 
 
 def read_task(directory: Path) -> dict[str, Any]:
-    """Return what is being collected in ``directory``. Raises DataError."""
-    data = files.read_bytes(directory / LOG, limit=files.JSON_LIMIT_BYTES)
+    """Return what is being collected in ``directory``.
+
+    Raises:
+        DataError: the log is damaged, or of a newer schema.
+    """
+    path = directory / LOG
+    data = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES)
     try:
-        return files.parse_json(data.split(b"\n")[0])
+        task = {"schema": SCHEMA, **files.parse_json(data.split(b"\n")[0])}
     except ValueError as error:
-        raise DataError(f"{directory / LOG} is damaged: {error}") from None
+        raise DataError(
+            f"{path} is damaged: {error}",
+            hint=f"delete {directory} to collect again, or choose another --out DIR",
+        ) from None
+    files.check_schema(task.pop("schema"), SCHEMA, f"unfinished dataset {directory}")
+    return task
+
+
+def _line(value: Mapping[str, Any]) -> bytes:
+    return files.canonical_json(value).encode() + b"\n"
 
 
 def _intact(path: Path, digest: str) -> bool:

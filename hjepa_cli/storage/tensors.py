@@ -18,10 +18,18 @@ from hjepa_cli.errors import DataError
 from hjepa_cli.storage.files import canonical_json, parse_json
 
 METADATA_KEY = "hjepa"
-HEADER_LIMIT_BYTES = 16 * 2**20
+HEADER_LIMIT_BYTES = 2**20
 DTYPES = ("float32", "int64", "uint8")
 
 _LFS_POINTER = b"version https://git-lfs"
+_MALFORMED = (
+    SafetensorError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,  # a dimension beyond what numpy counts with
+)
 
 
 def pack(tensors: Mapping[str, np.ndarray], metadata: str | None = None) -> bytes:
@@ -30,10 +38,13 @@ def pack(tensors: Mapping[str, np.ndarray], metadata: str | None = None) -> byte
     Equal arrays give equal bytes, whatever their strides or byte order.
 
     Raises:
-        ValueError: a dtype other than :data:`DTYPES`.
+        ValueError: a dtype other than :data:`DTYPES`, or more text than :func:`unpack` accepts.
     """
     plain = {name: plain_array(array, name) for name, array in tensors.items()}
-    return safetensors_numpy.save(plain, None if metadata is None else {METADATA_KEY: metadata})
+    data = safetensors_numpy.save(plain, None if metadata is None else {METADATA_KEY: metadata})
+    if (length := int.from_bytes(data[:8], "little")) > HEADER_LIMIT_BYTES:
+        raise ValueError(f"a header of {length} bytes; readers accept {HEADER_LIMIT_BYTES}")
+    return data
 
 
 def unpack(data: bytes, path: Path) -> tuple[dict[str, np.ndarray], str | None]:
@@ -51,7 +62,7 @@ def unpack(data: bytes, path: Path) -> tuple[dict[str, np.ndarray], str | None]:
             raise ValueError(f"unexpected dtype {', '.join(sorted(foreign))}")
         metadata = header.get("__metadata__", {}).get(METADATA_KEY)
         return safetensors_numpy.load(data), metadata
-    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except _MALFORMED as error:
         reason = str(error).partition("\n")[0]
         raise DataError(f"{path} is damaged or not a safetensors file: {reason}") from None
 
