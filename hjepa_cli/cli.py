@@ -20,6 +20,7 @@ from hjepa_cli import __version__, options, plan, torchrun
 from hjepa_cli.checks import COMPARED
 from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, resolve
 from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
+from hjepa_cli.plan import Plan
 from hjepa_cli.screen import Screen, one_line
 from hjepa_cli.tools import config_app, data_app, report, reproduce, view
 
@@ -83,9 +84,14 @@ def _run_command(argv: list[str], errors: TextIO) -> int:
 
 def _expected(error: Exception, argv: list[str]) -> HjepaError:
     """Every exception as one of ours: a message, a hint and an exit code."""
-    names = list(get_command(app).commands)  # type: ignore[attr-defined]
-    command = next((word for word in argv if word in names), None)
-    usage = f"hjepa {command} --help" if command else f"commands: {', '.join(names)}"
+    named, group = [], get_command(app)
+    for word in argv:
+        if word in (inside := getattr(group, "commands", {})):
+            named.append(word)
+            group = inside[word]
+    usage = f"commands: {', '.join(getattr(group, 'commands', {}))}"
+    if named:
+        usage = f"hjepa {' '.join(named)} --help"
     if isinstance(error, HjepaError):
         if error.hint is None:
             again = "restore the file or make it again; what this command reads: "
@@ -441,6 +447,7 @@ def resume(
     cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
     debug: options.Debug = False,
 ) -> None:
     """Take up an interrupted run: same settings, same inputs, same result."""
@@ -451,7 +458,12 @@ def resume(
 
         return run(directory, screen)
 
-    execute(screen, stage, workers=workers, cluster=cluster, shared=True)
+    def planned() -> Plan:
+        from hjepa_cli.stages.resume import planned
+
+        return planned(directory)
+
+    execute(screen, stage, planned, dry_run=dry_run, workers=workers, cluster=cluster, shared=True)
 
 
 app.command(rich_help_panel=PIPELINE)(reproduce)

@@ -48,41 +48,60 @@ METADATA: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Style:
-    """How one method is drawn everywhere. Hollow markers: controllers that see the true state."""
+    """How one method is drawn everywhere. Hollow markers: controllers that see the true state.
+
+    Curves of equally good methods lie on each other. So solid lines with large markers are drawn
+    first, dashed ones with smaller markers over them, and all stay visible.
+    """
 
     colour: str  # Okabe and Ito's palette, safe for colour-blind readers
     marker: str
     line: Any = "-"
     hollow: bool = False
+    size: float = 4.0  # of the marker, in points
+
+    def looks(self, scale: float = 1.0) -> dict[str, Any]:
+        """What ``Axes.plot`` takes."""
+        return {
+            "color": self.colour,
+            "linestyle": self.line,
+            "marker": self.marker,
+            "markersize": scale * self.size,
+            "markerfacecolor": "none" if self.hollow else self.colour,
+            "markeredgecolor": self.colour if self.hollow else "white",
+            "markeredgewidth": 1.0 if self.hollow else 0.4,
+            "zorder": 3.0 - 0.1 * self.size,
+        }
 
 
+DASH_DOT_DOT = (0, (3, 1, 1, 1, 1, 1))
 STYLES = {
-    "hjepa": Style("#0072B2", "o"),
-    "ts-jepa-1": Style("#D55E00", "s", "--"),
-    "ts-jepa-4": Style("#009E73", "^", "-."),
+    "hjepa": Style("#0072B2", "o", size=7.0),
+    "ts-jepa-1": Style("#D55E00", "s", "--", size=2.8),
+    "ts-jepa-4": Style("#009E73", "^", "-.", size=5.0),
     "hold": Style("#CC79A7", "v", ":"),
-    "zero": Style("#E69F00", "D", (0, (3, 1, 1, 1, 1, 1))),
-    "oracle": Style("#000000", "o", "-", hollow=True),
-    "hold-true": Style("#7F7F7F", "v", ":", hollow=True),
-    "zero-true": Style("#7F7F7F", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
+    "zero": Style("#E69F00", "D", DASH_DOT_DOT, size=3.5),
+    "oracle": Style("#000000", "o", "-", hollow=True, size=8.5),
+    "hold-true": Style("#7F7F7F", "v", ":", hollow=True, size=6.5),
+    "zero-true": Style("#7F7F7F", "D", DASH_DOT_DOT, hollow=True, size=6.5),
+    "ts-jepa-2": Style("#56B4E9", "<", "--"),
+    "ts-jepa-3": Style("#56B4E9", ">", "-."),
+    "ts-jepa-5": Style("#56B4E9", "p", ":"),
+    "supervised-2": Style("#882255", "P", "--"),
+    "supervised-4": Style("#882255", "X", "-."),
+    "autoencoder-2": Style("#999933", "h", "--"),
+    "linear": Style("#44AA99", "d", "--"),
+    "state-kf": Style("#332288", "*", "--", size=5.5),
+    "state-48": Style("#332288", "8", "-."),
+    "local": Style("#000000", "s", ":", hollow=True, size=6.5),
     "optimal": Style("#000000", "x", ":"),
-    "ts-jepa-2": Style("#66C2A5", "<", "-."),
-    "ts-jepa-3": Style("#41AE76", ">", "-."),
-    "ts-jepa-5": Style("#00441B", "h", "-."),
-    "supervised-2": Style("#8C510A", "P", "--"),
-    "supervised-4": Style("#BF812D", "X", "--"),
-    "autoencoder-2": Style("#DFC27D", "p", "--"),
-    "linear": Style("#56B4E9", "d", (0, (5, 1))),
-    "state-kf": Style("#7B3294", "*", (0, (5, 1)), hollow=True),
-    "state-48": Style("#C2A5CF", "p", (0, (5, 1)), hollow=True),
-    "local": Style("#404040", "+", ":"),
 }
-OTHERS = [Style("#56B4E9", marker, "--") for marker in "PX<>phd*"]
+OTHERS = [Style("#7F7F7F", marker, ":") for marker in "<>phd*PX"]
 LONGEST_OF_THREE = 15  # characters of a label, for three columns of a legend
 
 SCHEDULER_STYLES = {
     "round-robin": Style("#7F7F7F", "s", ":", hollow=True),
-    "opportunistic": Style("#E69F00", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
+    "opportunistic": Style("#E69F00", "D", DASH_DOT_DOT, hollow=True),
     "max-aoi": Style("#009E73", "^", "-."),
     "drift-plus-penalty": Style("#CC79A7", "v", "--", hollow=True),
     "whittle": Style("#D55E00", "s", "--"),
@@ -213,13 +232,9 @@ def _draw(axes: Axes, label: str, points: np.ndarray, style: Style) -> None:
     axes.plot(
         snr_db,
         np.where(devices > 0, devices, np.nan),
-        color=style.colour,
-        linestyle=style.line,
-        marker=style.marker,
-        markerfacecolor="none" if style.hollow else style.colour,
         markevery=-(-len(points) // MARKERS),
-        markersize=6.5 if style.hollow else 4,  # a ring stays visible around a filled marker
         label=label,
+        **style.looks(),
     )
     if len(points) > 1:
         axes.fill_between(snr_db, low, high, color=style.colour, alpha=0.18, linewidth=0)
@@ -404,13 +419,9 @@ def draw_line(
     axes.plot(
         where,
         value,
-        color=style.colour,
-        linestyle=style.line,
-        marker=style.marker,
-        markerfacecolor="none" if style.hollow else style.colour,
         markevery=-(-len(where) // MARKERS),
-        markersize=5.5 if style.hollow else 3.5,
         label=method,
+        **style.looks(0.9),
     )
     axes.fill_between(where, band[:, 0], band[:, 1], color=style.colour, alpha=0.18, linewidth=0)
 

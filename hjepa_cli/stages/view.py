@@ -30,6 +30,7 @@ from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.subject import open_subject
+from hjepa_cli.storage import files
 
 FADING_KEY = 0xFAD1
 PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encoded in seconds
@@ -138,6 +139,7 @@ def run(
     """
     try:
         from hjepa_cli import animation
+        from hjepa_cli import live as terminal
     except ModuleNotFoundError as missing:
         if missing.name != "PIL":
             raise
@@ -146,11 +148,13 @@ def run(
         ) from None
     if not live:
         animation.check_target(out)
+        files.make_directory(out.parent)
     elif not screen.is_terminal:
         raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
     subject = open_subject(settings, screen, checkpoint, None)
     if subject.model is None:
-        raise MissingInputError(f"no model of plant {settings.plant}", hint="hjepa train-hierarchy")
+        train = f"hjepa reproduce --preset {settings.preset}"
+        raise MissingInputError(f"no model of plant {settings.plant}", hint=train)
     check_methods(settings.methods, subject.model)
 
     link = make_link(settings, subject.model, devices, snr_db, delivery, gap_steps)
@@ -174,7 +178,7 @@ def run(
         "file": None if live else out,
     }
     if live:
-        animation.play(pictures, fps)
+        terminal.play(pictures, fps)
         return result
     with screen.progress("draw", len(pictures), "pictures") as bar:
         animation.write(pictures, out, fps, bar.advance)
