@@ -194,6 +194,28 @@ def test_any_checkpoint_brings_its_encoder_but_only_a_hierarchy_drives(workplace
         Model.load(workplace / "encoder" / "model.safetensors")
 
 
+def test_other_strides_share_what_depends_on_none(workplace: Path) -> None:
+    train(workplace, "whole")
+    first = networks(workplace / "whole")
+
+    def shared(out: str, **changes: object) -> list[bool]:
+        train(workplace, out, encoder="whole", **changes)
+        second = networks(workplace / out)
+        return [
+            all(map(torch.equal, first[name].parameters(), second[name].parameters()))
+            for name in ("actor", "flat", "high")
+        ]
+
+    assert shared("shared", hierarchy__h=2, hierarchy__m=1) == [True, True, False]
+    assert shared("more-steps", hierarchy__h=2, hierarchy__m=1, hierarchy__coarse_steps=3)[:2] == [
+        True,
+        True,
+    ]
+    assert shared("longer", hierarchy__h=2, hierarchy__m=1, hierarchy__flat_steps=3)[1] is False
+    assert shared("other-actor", hierarchy__h=2, hierarchy__m=1, actor__dropout=0.5)[0] is False
+    assert shared("other-seed", hierarchy__h=2, hierarchy__m=1, seed=1) == [False] * 3
+
+
 def test_a_rejected_encoder_is_kept_apart_and_can_be_used(workplace: Path) -> None:
     rejected = workplace / "gated" / "rejected.safetensors"
     result = train_hierarchy.run(

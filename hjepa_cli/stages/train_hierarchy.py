@@ -8,7 +8,7 @@ frozen: every frame is encoded once, and all that follows are small networks on 
 
 import copy
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,11 @@ from hjepa_cli.storage.zoo import find_model, resolve_model
 
 STREAM = 3  # this stage's branch of the seed tree
 REPORT_EVERY = 50  # steps between rows of metrics.csv
+SHARED = ("actor", "flat")  # networks that depend on no stride
+FLAT_SETTINGS = (  # all that the training of the flat baseline depends on
+    *("rollout_steps", "batch_trajectories", "flat_starts", "flat_steps"),
+    *("optimizer", "schedule", "gradient_clip", "coarse_learning_rate", "coarse_weight_decay"),
+)
 ARCHITECTURE = ("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual")
 
 
@@ -95,13 +100,18 @@ def run(
         started = "high" in trained and "high" in modules
         if started and source.metadata["architecture"]["h"] == strides.h:
             modules["high"].load_state_dict(trained["high"].state_dict())
+        shared = [name for name in SHARED if trained_alike(source, data, settings)]
+        for name in shared:
+            modules[name].load_state_dict(trained[name].state_dict())
+        if shared:
+            screen.say("actor and ts-jepa-1 are the encoder checkpoint's: same data and settings")
         modules.to(resolve_device(settings.device))
 
         train, test = (render(split, settings.plant, screen) for split in recorded.values())
         exact = architecture["mirror"] == "exact"
         flip = architecture["mirror"] == "augment"
         seen = embed_all(modules["encoder"], train, settings, screen, flip=flip)
-        if progress.fresh:  # otherwise it comes back with the levels
+        if progress.fresh and "actor" not in shared:  # otherwise it comes back with the levels
             screen.say("fitting the semantic actor")
             actor = fit_actor(
                 torch.cat([data.z.flatten(0, 1) for data, _ in seen]),
@@ -112,7 +122,7 @@ def run(
             )
             modules["actor"].load_state_dict(actor.state_dict())
         embedded = [data for data, _ in seen]
-        train_levels(modules, embedded, strides, settings, record, progress, screen)
+        train_levels(modules, embedded, strides, settings, record, progress, screen, shared)
 
         metadata = {
             "stage": "train-hierarchy",
@@ -205,6 +215,24 @@ def open_encoder(name: str | None, settings: Settings, screen: Screen) -> Checkp
     return checkpoint
 
 
+def trained_alike(source: Checkpoint, data: Dataset, settings: Settings) -> bool:
+    """Whether what depends on no stride was trained in ``source`` as it would be now.
+
+    Then one actor and one ``ts-jepa-1`` serve all strides on an encoder: comparisons between
+    strides are not blurred by another training of either, and take half the time.
+    """
+    metadata, mine = source.metadata, settings.as_dict()
+    if metadata["architecture"]["kind"] not in ("hierarchy", "flat"):
+        return False
+    theirs = metadata["settings"]
+    return (
+        (metadata["dataset"], metadata["seed"]) == (data.digest, settings.seed)
+        and theirs["actor"] == mine["actor"]
+        and theirs["encoder"]["precision"] == mine["encoder"]["precision"]
+        and all(theirs["hierarchy"].get(key) == mine["hierarchy"][key] for key in FLAT_SETTINGS)
+    )
+
+
 def described(encoder: dict[str, Any]) -> dict[str, Any]:
     """The settings of an encoder that its architecture records."""
     return {name: encoder[name] for name in ARCHITECTURE}
@@ -266,8 +294,12 @@ def train_levels(
     record: Run,
     progress: Progress,
     screen: Screen,
+    trained: Sequence[str] = (),
 ) -> None:
-    """Train the levels that the model has, in the order in which each builds on the last."""
+    """Train the levels that the model has, in the order in which each builds on the last.
+
+    Those ``trained`` already stay as they are.
+    """
     options = settings.hierarchy
     h, m, l = strides.h, strides.m, strides.l
     coarse_data = join(seen)
@@ -333,7 +365,8 @@ def train_levels(
         fit("medium", "medium", options.medium_steps, fine_data, medium_loss)
     if m > l:
         fit("low", "low", options.low_steps, fine_data, low_loss)
-    fit("flat", "coarse", options.flat_steps, coarse_data, flat_loss)
+    if "flat" not in trained:
+        fit("flat", "coarse", options.flat_steps, coarse_data, flat_loss)
 
 
 def name_batch(
