@@ -232,18 +232,18 @@ def test_a_simulation_that_diverges_is_a_numerical_failure(monkeypatch: pytest.M
 
 
 def test_memory_does_not_grow_with_the_dataset(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten times the trajectories, and hardly more than their lines in the manifest."""
-    monkeypatch.setattr(datasets, "SHARD_TRAJECTORIES", 20)
+    """Six times the trajectories, and hardly more than their lines in the manifest."""
+    monkeypatch.setattr(datasets, "SHARD_TRAJECTORIES", 10)
     peaks = []
-    for count in (40, 400):
-        settings = small(trajectories=count, steps=100)
+    for count in (20, 120):
+        settings = small(trajectories=count, steps=60)
         with placed(0):
             tracemalloc.start()
             collect.run(settings, SCREEN, out=Path(f"data-{count}"))
             peaks.append(tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
-    a_shard_bytes = 20 * (101 * 16 + 100 * 8)
-    assert 360 * (101 * 16 + 100 * 8) > 5 * a_shard_bytes  # what holding all would add
+    a_shard_bytes = 10 * (61 * 16 + 60 * 8)
+    assert 100 * (61 * 16 + 60 * 8) > 5 * a_shard_bytes  # what holding all would add
     assert peaks[1] - peaks[0] < 2 * a_shard_bytes, peaks
 
 

@@ -21,7 +21,10 @@ from hjepa_cli.errors import DataError, HjepaError, UsageError
 from hjepa_cli.settings import load_settings
 
 fuzz = load("fuzz")
-CASES = {"Checkpoint": 300, "Dataset": 250, "Curves": 200, "Records": 120, "Toml": 115}
+CASES = {
+    **{"Checkpoint": 280, "Dataset": 230, "Curves": 180},
+    **{"Records": 110, "Progress": 80, "Toml": 105},
+}
 MODELS = 15
 
 
