@@ -203,7 +203,7 @@ def build_loops(settings: Settings) -> dict[str, Loop]:
         with autocast(CPU, options.precision):
             terms = jepa.losses(batch)
         update.step(jepa.total(terms), 0)
-        jepa.update_target()
+        jepa.after_step()
 
     window = windows.window_frames
     starts = torch.arange(window - 1)

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hjepa_cli.errors import UsageError
-from hjepa_cli.settings import RadioSettings, Settings, dotted
+from hjepa_cli.settings import EncoderSettings, RadioSettings, Settings, dotted
 
-# Spec §8: every method `eval` and `scale` may be asked for; those without a model are skipped.
+# Every method `eval` and `scale` may be asked for; those without a model are skipped.
 METHODS = (
     "hjepa",
     "ts-jepa-1",
@@ -36,6 +36,19 @@ METHODS = (
 
 # Those that send the true state: they render and encode nothing.
 TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
+
+# Those that send camera frames as they are and act on them: no codec, no prediction.
+RAW_FRAMES = ("supervised-2", "supervised-4", "autoencoder-2")
+
+LATE = "+"  # between a method and the steps that its packets are late
+
+# Those whose packets need no link, or that send none.
+LINKLESS = ("optimal", "local")
+
+# Those fitted in closed form to embeddings, where they are measured.
+ANCHORS = ("linear", "state-kf", "state-48", "local")
+
+FRAMES = {"jepa": (2,), "supervised": (2, 4), "autoencoder": (2,)}  # κ, by --method
 
 SCHEDULERS = (
     *("round-robin", "opportunistic", "max-aoi", "drift-plus-penalty", "whittle"),
@@ -64,6 +77,7 @@ def check_settings(settings: Settings) -> None:
     if settings.seed > LARGEST_SEED:
         raise UsageError(f"seed = {settings.seed}; expected at most {LARGEST_SEED}")
     check_strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
+    _check_frames(settings.encoder)
     check_methods(settings.methods)
     gaps = settings.protocol.gaps
     if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
@@ -113,6 +127,17 @@ def check_methods(methods: tuple[str, ...]) -> None:
             raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
 
 
+def late(method: str, steps: int) -> str:
+    """A method whose packets arrive ``steps`` steps after they were sent: ``supervised-2+3``."""
+    return f"{method}{LATE}{steps}" if steps else method
+
+
+def split_late(name: str) -> tuple[str, int]:
+    """The method behind :func:`late`, and the steps."""
+    method, _, steps = name.partition(LATE)
+    return method, int(steps or 0)
+
+
 def parse_payload(name: str) -> tuple[str, int, int]:
     """Read the name of a payload.
 
@@ -133,6 +158,13 @@ def parse_payload(name: str) -> tuple[str, int, int]:
         f"unknown payload '{name}'; choose float32, float16, int2 … int16, or pca-NxB for N "
         "principal components (1 to 256) of B bits (1 to 16), like pca-8x6"
     )
+
+
+def _check_frames(encoder: EncoderSettings) -> None:
+    taken = FRAMES[encoder.method]
+    if encoder.frames not in taken:
+        choices = " or ".join(str(count) for count in taken)
+        raise UsageError(f"--frames {encoder.frames}: method {encoder.method} takes {choices}")
 
 
 def _check_radio(radio: RadioSettings) -> None:

@@ -182,6 +182,8 @@ def collect(
 
 @app.command("train-encoder", rich_help_panel=PIPELINE)
 def train_encoder(
+    method: options.EncoderMethod = None,
+    frames: options.InputFrames = None,
     h: options.StrideH = None,
     steps: options.TrainingSteps = None,
     gate: options.Gate = None,
@@ -197,7 +199,7 @@ def train_encoder(
     dry_run: options.DryRun = False,
     debug: options.Debug = False,
 ) -> None:
-    """Learn an encoder of camera frames with a joint-embedding predictive objective."""
+    """Learn an encoder of camera frames by joint-embedding prediction, or train a baseline."""
     settings = resolve(
         preset,
         config,
@@ -205,6 +207,8 @@ def train_encoder(
             "plant": plant,
             "seed": seed,
             "device": device,
+            "encoder.method": method,
+            "encoder.frames": frames,
             "encoder.h": h,
             "encoder.steps": steps,
             "encoder.gate": gate,
@@ -245,7 +249,12 @@ def train_hierarchy(
     dry_run: options.DryRun = False,
     debug: options.Debug = False,
 ) -> None:
-    """Train the three predictors of the hierarchy, the flat baseline and the semantic actor."""
+    """Train the predictors of the hierarchy, the flat baseline and the semantic actor.
+
+    --h without --m and --l trains a single level: TS-JEPA of that depth.
+    """
+    if h is not None and m is None and l is None:
+        m = l = h
     settings = resolve(
         preset,
         config,

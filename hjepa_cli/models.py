@@ -85,7 +85,7 @@ def missing_curves(model: ZooModel) -> list[str]:
         DataError: not a model that can drive, or damaged curves.
     """
     from hjepa_cli.core.model import Model  # torch: seconds that the other commands need not wait
-    from hjepa_cli.stages.evaluate import Subject
+    from hjepa_cli.stages.subject import Subject
     from hjepa_cli.storage import curves
 
     plant = model.metadata.get("plant")

@@ -275,6 +275,21 @@ FileOut = Annotated[
 
 # --- model
 
+EncoderMethod = Annotated[
+    str | None,
+    _one_of(
+        MODEL,
+        "--method",
+        "What to train: the joint-embedding encoder, or a baseline that acts on raw frames.",
+        "jepa",
+        "supervised",
+        "autoencoder",
+    ),
+]
+InputFrames = Annotated[
+    int | None,
+    _count(MODEL, "--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
+]
 TrainingSteps = Annotated[int | None, _count(MODEL, "--steps", "Training steps of the encoder.")]
 StrideH = Annotated[
     int | None, _count(MODEL, "--h", "Stride of the high level in control steps, a multiple of m.")

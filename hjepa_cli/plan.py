@@ -9,13 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.checks import LINKLESS, TRUE_STATE
 from hjepa_cli.errors import HjepaError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 
 if TYPE_CHECKING:
-    from hjepa_cli.stages.evaluate import Subject
+    from hjepa_cli.stages.subject import Subject
 
 FRAME_BYTES = 64 * 128 * 3
 ENCODER_PARAMETERS = 700_000
@@ -264,7 +264,7 @@ def _plan_scheduled(
 ) -> Plan:
     """Plan of ``hjepa scale --law scheduled``: every load is simulated, none is cached."""
     radio = settings.radio
-    methods = [name for name in subject.measurable(settings.methods) if name != "optimal"]
+    methods = [name for name in subject.measurable(settings.methods) if name not in LINKLESS]
     searches = len(radio.schedulers) * radio.seeds
     if radio.topology == "hall":  # margins depend on the SNR
         searches *= len(snr_db)
@@ -319,7 +319,7 @@ def _predictor(settings: Settings, actions: int) -> int:
 
 def _subject(settings: Settings, checkpoint: str | None, dataset: Path | None) -> "Subject":
     """What the stage would open, without a word."""
-    from hjepa_cli.stages.evaluate import open_subject
+    from hjepa_cli.stages.subject import open_subject
 
     return open_subject(settings, Screen(quiet=True), checkpoint, dataset)
 

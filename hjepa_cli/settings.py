@@ -55,8 +55,10 @@ class CollectSettings:
 
 @dataclasses.dataclass(frozen=True)
 class EncoderSettings:
-    """``train-encoder``: the JEPA with its companion P^H, then the probe actor."""
+    """``train-encoder``: the JEPA with its companion P^H, then the probe actor; or a baseline."""
 
+    method: Literal["jepa", "supervised", "autoencoder"]
+    frames: int  # κ, of the input
     embedding: int
     hidden: int
     h: int

@@ -25,12 +25,13 @@ from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.loop import Outcome
-from hjepa_cli.core.methods import embedding_method, embedding_sensor, true_state_method
+from hjepa_cli.core.methods import embedding_method, true_state_method
 from hjepa_cli.core.model import Model, build_modules, tensors_of
 from hjepa_cli.core.payload import quantise
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.policy import teacher
 from hjepa_cli.core.protocol import Point
+from hjepa_cli.core.sensors import embedding_sensor
 from hjepa_cli.core.simulator import BLOCK_DEVICES, Block, Simulator, Tick, run_points
 from hjepa_cli.core.workers import open_workers, single_thread
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
@@ -590,9 +591,9 @@ def test_the_sensor_renders_encodes_and_quantises(checkpoint: Path) -> None:
     camera = Camera(DESKTOP)
     frames = np.stack([camera.render(states[0]), camera.render(states[1])], axis=1)
     expected = quantise(model.encode(frames), 8)
-    assert torch.allclose(sense(states[0], states[1]), expected, atol=1e-5)
+    assert torch.allclose(sense(np.stack([*states], axis=1)), expected, atol=1e-5)
     assert not torch.equal(expected, model.encode(frames))
-    swapped = sense(states[1], states[0])
+    swapped = sense(np.stack([*states[::-1]], axis=1))
     assert not torch.allclose(swapped, expected, atol=1e-2)
 
 
@@ -600,9 +601,10 @@ def test_large_batches_are_encoded_like_small_ones(checkpoint: Path) -> None:
     model = Model.load(checkpoint, "cpu")
     states = np.random.default_rng(0).normal(size=(2, 300, 4)) * 0.05
     sense = embedding_sensor(model, INT8)
-    together = sense(states[0], states[1])
+    seen = np.stack([*states], axis=1)
+    together = sense(seen)
     assert together.shape == (300, 256)
-    assert torch.allclose(together[290:], sense(states[0, 290:], states[1, 290:]), atol=0.05)
+    assert torch.allclose(together[290:], sense(seen[290:]), atol=0.05)
 
 
 def test_embedding_methods_start_with_the_actor_s_force(checkpoint: Path) -> None:

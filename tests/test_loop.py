@@ -33,8 +33,8 @@ def protocol(**changes: Any) -> ProtocolSettings:
     return dataclasses.replace(load_settings().protocol, **{"steps": 60, **changes})
 
 
-def true_state(previous: np.ndarray, states: np.ndarray) -> np.ndarray:
-    return states
+def true_state(seen: np.ndarray) -> np.ndarray:
+    return seen[:, -1]
 
 
 # --- Schedules ----------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ class Recorder:
         return np.full(self.devices, 0.1 * len(self.packets))
 
 
-def test_a_packet_of_step_k_carries_frames_k_minus_1_and_k() -> None:
+def test_a_packet_of_step_k_carries_the_frames_up_to_k() -> None:
     """Golden index test: replay the plant alone and look up every state that was sent."""
     draws = Draws.make(protocol(steps=12), 2, seed=0)
     recorder = Recorder(2)
@@ -218,7 +218,7 @@ def test_a_packet_of_step_k_carries_frames_k_minus_1_and_k() -> None:
         draws,
         gap_schedule(5, 12, 2)[None],
         recorder,
-        lambda previous, states: np.stack([previous, states], axis=1),
+        lambda seen: seen,
     )
     poles = CartPoles(DESKTOP, 2)
     poles.states = draws.initial
@@ -234,9 +234,9 @@ def test_a_packet_of_step_k_carries_frames_k_minus_1_and_k() -> None:
     }
     assert sent_at == {0: [0, 5, 10], 1: [0, 1, 6, 11]}
     for k, packets in enumerate(recorder.packets):
-        for device, (previous, current) in packets.items():
-            assert np.allclose(previous, trajectory[k - 1][device], atol=1e-12)
-            assert np.allclose(current, trajectory[k][device], atol=1e-12)
+        for device, seen in packets.items():
+            expected = [trajectory[max(k - back, -1)][device] for back in (3, 2, 1, 0)]
+            assert np.allclose(seen, expected, atol=1e-12)
 
 
 def test_with_every_packet_hold_zero_and_oracle_are_the_optimal_controller() -> None:
@@ -266,9 +266,9 @@ def test_states_are_clipped_and_nothing_ends_a_run() -> None:
 
     seen = []
 
-    def sensor(previous: np.ndarray, states: np.ndarray) -> np.ndarray:
-        seen.append(states)
-        return states
+    def sensor(states: np.ndarray) -> np.ndarray:
+        seen.append(states[:, -1])
+        return states[:, -1]
 
     outcome = simulate(DESKTOP, draws, every_step(400, 2)[None], Shove(), sensor)
     assert len(seen) == 400

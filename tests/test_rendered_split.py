@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.codecs import Integers
-from hjepa_cli.core.methods import embedding_sensor
+from hjepa_cli.core.sensors import embedding_sensor
 from hjepa_cli.core.plant import plant
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
@@ -55,7 +55,7 @@ def test_pairs_are_the_frame_before_and_the_frame_of_a_step(
     k = np.arange(0, STEPS, every)
     before, now = recorded.states[:, k], recorded.states[:, k + 1]
     expected = pictures(np.stack([before, now], axis=2)).flatten(0, 1)
-    assert torch.equal(split.pairs(every), expected)
+    assert torch.equal(split.seen(every), expected)
     assert not torch.equal(expected[:, 0], expected[:, 1])
 
 
@@ -65,13 +65,13 @@ def test_mirrored_pairs_show_the_mirrored_states(
 ) -> None:
     k = np.arange(0, STEPS, every)
     mirrored = -np.stack([recorded.states[:, k], recorded.states[:, k + 1]], axis=2)
-    assert torch.equal(split.pairs(every, mirrored=True), pictures(mirrored).flatten(0, 1))
+    assert torch.equal(split.seen(every, mirrored=True), pictures(mirrored).flatten(0, 1))
 
 
 @pytest.mark.parametrize("every", [1, 2, 4])
 def test_states_and_labels_belong_to_the_current_frame(split: RenderedSplit, every: int) -> None:
     states, labels = split.states_at(every), split.labels_at(every)
-    assert torch.equal(pictures(states.numpy()), split.pairs(every)[:, 1])
+    assert torch.equal(pictures(states.numpy()), split.seen(every)[:, 1])
     torch.testing.assert_close(labels * LIMIT_N, 10 * states[:, 2])
     torch.testing.assert_close(split.actions * LIMIT_N, 10 * split.states[..., 0])
 
@@ -82,14 +82,14 @@ def test_stored_frames_are_read_as_rendered_ones(
     stored = Trajectories(
         recorded.states, recorded.applied_n, recorded.teacher_n, pictures(recorded.states).numpy()
     )
-    assert torch.equal(render(stored, "desktop", QUIET).pairs(1), split.pairs(1))
+    assert torch.equal(render(stored, "desktop", QUIET).seen(1), split.seen(1))
 
 
 @pytest.mark.parametrize("mirror", [False, True])
 def test_training_batches_hold_the_same_pairs(split: RenderedSplit, mirror: bool) -> None:
     windows = FrameWindows(split.frames, split.actions, window_frames=3, stride=4, mirror=mirror)
     batch = windows.draw(12, np.random.default_rng(1))
-    plain, mirrored = split.pairs(1), split.pairs(1, mirrored=True)
+    plain, mirrored = split.seen(1), split.seen(1, mirrored=True)
     actions = split.actions.flatten()
     signs = set()
     for window, played in zip(batch.frames.unflatten(0, (12, 3)), batch.actions, strict=True):
@@ -148,17 +148,17 @@ def test_the_closed_loop_encodes_the_same_pairs(
     recorded: Trajectories, split: RenderedSplit
 ) -> None:
     class Spy:
-        plant_name, device = "desktop", "cpu"
+        plant_name, device, frames = "desktop", "cpu", 2
 
         def encode(self, frames: np.ndarray) -> Tensor:
-            self.frames = torch.from_numpy(frames)
+            self.shown = torch.from_numpy(frames)
             return torch.ones(len(frames), 4)
 
     spy = Spy()
     sense = embedding_sensor(spy, Integers(4, 8))  # type: ignore[arg-type]
-    previous, current = recorded.states[:, :-1], recorded.states[:, 1:]
-    sense(previous.reshape(-1, 4).astype(float), current.reshape(-1, 4).astype(float))
-    assert torch.equal(spy.frames, split.pairs(1))
+    pairs = np.stack([recorded.states[:, :-1], recorded.states[:, 1:]], axis=2)
+    sense(pairs.reshape(-1, 2, 4).astype(float))
+    assert torch.equal(spy.shown, split.seen(1))
 
 
 # ---- painted frames: value 0 is the time, value 1 the trajectory ---------------------------------

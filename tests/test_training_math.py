@@ -97,7 +97,7 @@ def test_updating_the_target_moves_it_by_one_minus_the_decay() -> None:
     before = model.target.module.head.weight.clone()
     with torch.no_grad():
         model.encoder.head.weight.add_(1.0)
-    model.update_target()
+    model.after_step()
     torch.testing.assert_close(model.target.module.head.weight, before + 0.25)
 
 

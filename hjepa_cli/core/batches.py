@@ -8,20 +8,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hjepa_cli.core.history import frames_seen
+
 
 @dataclasses.dataclass(frozen=True)
 class TrajectoryBatch:
     """B windows of F frames, ``stride`` control steps apart.
 
     Attributes:
-        frames: uint8 [B · F, 2, H, W, 3], (previous, current).
+        frames: uint8 [B · F, κ, H, W, 3], the current one last.
         actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
         drawn: which windows were drawn, for messages.
+        labels: what the teacher would do there ÷ force limit [B · F, *A], if the windows have any.
     """
 
     frames: Tensor
     actions: Tensor
     drawn: str = ""
+    labels: Tensor | None = None
 
 
 def window_indices(
@@ -57,6 +61,8 @@ class FrameWindows:
             its frames. Exact physics as well, as long as nothing leaves the picture: the same
             motion elsewhere on the track.
         mirrored_actions: what mirroring does to actions, a factor for each.
+        labels: the teacher's actions ÷ force limit [N, T, *A], where they are wanted.
+        frames_each: κ, of which a device remembers no more than it has seen.
     """
 
     def __init__(
@@ -69,12 +75,15 @@ class FrameWindows:
         mirror: bool,
         shift_px: int = 0,
         mirrored_actions: float | tuple[float, ...] = -1.0,
+        labels: Tensor | None = None,
+        frames_each: int = 2,
     ) -> None:
         self.frames, self.actions = frames, actions
         self.steps = actions.shape[1]
         self.window_frames = min(window_frames, (self.steps - 1) // stride + 1)
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
         self.mirrored_actions = torch.tensor(mirrored_actions)
+        self.labels, self.frames_each = labels, frames_each
 
     def draw(
         self, count: int, generator: np.random.Generator, share: slice = slice(None)
@@ -90,18 +99,25 @@ class FrameWindows:
         k = torch.from_numpy(steps[share])
         actions = stride_actions(self.actions[trajectories], k, self.stride)
         rows = trajectories[:, None]
-        pairs = torch.stack([self.frames[rows, k], self.frames[rows, k + 1]], dim=2)
+        seen = torch.from_numpy(frames_seen(k.numpy(), self.frames_each))
+        frames = self.frames[rows[..., None], seen]
+        labels = None if self.labels is None else self.labels[rows, k]
         if self.mirror:
             flipped = torch.from_numpy((generator.random(count) < 0.5)[share])
-            pairs[flipped] = pairs[flipped].flip(-2)
+            frames[flipped] = frames[flipped].flip(-2)
             actions[flipped] *= self.mirrored_actions
+            if labels is not None:
+                labels[flipped] *= self.mirrored_actions
         if self.shift_px:
             shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)
-            for window, shift_px in zip(pairs, shifts[share], strict=True):
+            for window, shift_px in zip(frames, shifts[share], strict=True):
                 window.copy_(shift_sideways(window, int(shift_px)))
         windows = (f"{row} from k = {k[0]}" for row, k in zip(chosen, steps, strict=True))
         return TrajectoryBatch(
-            pairs.flatten(0, 1), actions, f"windows of trajectories {', '.join(windows)}"
+            frames.flatten(0, 1),
+            actions,
+            f"windows of trajectories {', '.join(windows)}",
+            None if labels is None else labels.flatten(0, 1),
         )
 
 

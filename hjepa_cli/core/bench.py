@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.core import metrics
-from hjepa_cli.core.loop import Outcome, play
+from hjepa_cli.core.loop import Outcome, last_states, play
 from hjepa_cli.core.methods import Method
 from hjepa_cli.core.protocol import KINDS, Curves, Point, Reference, measure_curves
 from hjepa_cli.core.simulator import Runner, Tick, run_points
@@ -72,8 +72,10 @@ class Bench:
 
     def entry(self, method: Method) -> dict[str, Any]:
         """What ``eval --json`` prints about a method's closed loop."""
+        if method.name == "optimal":
+            return _perfect_entry(self.protocol)
         if not method.uses_link:
-            return _flat_entry(self.protocol)
+            return self._flat_entry(method)
         curves = self.curves(method)
         described = {kind: self.reference.describe(*curves.grid[kind]) for kind in KINDS}
         brackets = {
@@ -101,6 +103,56 @@ class Bench:
             "delivery_bracket": brackets["delivery"],
             "n_devices": self.protocol.bracket_devices,
             "n_curve_devices": self.protocol.curve_devices,
+        }
+
+    def _flat_entry(self, method: Method) -> dict[str, Any]:
+        """Of a method without a link: one point measured, which is all of both its curves.
+
+        It tolerates every link, if its score is acceptable at all.
+        """
+        protocol, reference = self.protocol, self.reference
+        every = self._at_every_step(
+            method.name, max(protocol.curve_devices, protocol.bracket_devices)
+        )
+        few = protocol.curve_devices
+        [point] = reference.describe(
+            [EVERY_STEP], Outcome(every.score[:, :few], every.cost[:, :few])
+        )
+        del point["d"]
+        low, high = (
+            float(end) for end in metrics.interval(reference.score_replicates(every)).ravel()
+        )
+        end = float(protocol.gaps[-1])
+
+        def tolerated(score: float, level: float) -> float:
+            return end if score >= level else 0.0
+
+        level = protocol.acceptable_score
+        gap = tolerated(float(reference.relative_score(every)[0]), level)
+        ends = [tolerated(low, level), tolerated(high, level)]
+        lq = tolerated(point["lq_ratio"], protocol.acceptable_lq_ratio)
+        return {
+            "score": point["score"],
+            "score_ci95": point["ci95"],
+            "lq_ratio": point["lq_ratio"],
+            "bits_per_transmission": method.bits_per_transmission,
+            "tolerance_gap_steps": gap,
+            "tolerance_gap_ci95": ends,
+            "tolerance_gap_censored": gap == end,
+            "tolerance_gap_lq_steps": lq,
+            "tolerance_p": _probability(gap),
+            "tolerance_p_ci95": [_probability(end) for end in reversed(ends)],
+            "tolerance_p_censored": gap == end,
+            "tolerance_p_lq": _probability(lq),
+            **{
+                f"{kind}_curve": [
+                    {**Point(kind, float(gap)).coordinate(), **point} for gap in protocol.gaps
+                ]
+                for kind in KINDS
+            },
+            **{f"{kind}_bracket": [] for kind in KINDS},
+            "n_devices": protocol.bracket_devices,
+            "n_curve_devices": protocol.curve_devices,
         }
 
     def _lq_tolerance(self, kind: str, curve: Sequence[dict[str, Any]]) -> float:
@@ -133,13 +185,14 @@ def control_errors(
     rollouts = len(states)
     controller = method.controller(rollouts)
     if method.uses_link:
-        packets = method.sensor(states[:, 0], states[:, 1])
-        forces_n = play(controller, packets, rollouts, horizon + 1)
+        packets = method.sensor(last_states(states, 0))
+        delay_steps = method.delay_steps
+        forces_n = play(controller, packets, rollouts, horizon + 1, delay_steps=delay_steps)
     else:
         all_of_them = np.ones(rollouts, dtype=bool)
         forces_n = np.stack(
             [
-                controller.act(all_of_them, method.sensor(states[:, j], states[:, j + 1]))
+                controller.act(all_of_them, method.sensor(last_states(states, j)))
                 for j in range(horizon + 1)
             ],
             axis=1,
@@ -165,7 +218,7 @@ def control_entry(errors: Floats, replicates: int, seed: int) -> dict[str, Any]:
     }
 
 
-def _flat_entry(protocol: ProtocolSettings) -> dict[str, Any]:
+def _perfect_entry(protocol: ProtocolSettings) -> dict[str, Any]:
     """The teacher at every step against itself: 1 wherever it is asked, nothing to tolerate."""
     perfect = {
         "score": 1.0,

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
+from hjepa_cli.checks import split_late
 from hjepa_cli.core.capacity import (
     Noise,
     duty_devices,
@@ -36,6 +37,7 @@ class Need:
         at_least: the score was still acceptable where the measured range ends; there may be more.
         payload_bits: b.
         packets_per_slot: that reach the controller of a loop at its tolerance.
+        delay_steps: how late its packets were when the tolerance was measured.
     """
 
     method: str
@@ -44,20 +46,23 @@ class Need:
     at_least: bool
     payload_bits: int | None
     packets_per_slot: float | None
+    delay_steps: int = 0
 
     @classmethod
     def under(cls, law: Law, method: str, entry: Mapping[str, Any]) -> "Need":
-        """Read a method's entry of ``eval --json``."""
+        """Read the entry of ``eval --json`` of a method, on time or late."""
+        name, delay_steps = split_late(method)
         key, kind = ("tolerance_gap_steps", "gap") if law == "duty" else ("tolerance_p", "p")
         tolerance, ends = entry[key], entry[f"tolerance_{kind}_ci95"]
         ordered = None if ends is None else sorted(ends, reverse=law == "equal")
         return cls(
-            method=method,
+            method=name,
             tolerance=tolerance,
             interval=None if ordered is None else (ordered[0], ordered[1]),
             at_least=bool(entry[f"tolerance_{kind}_censored"]),
             payload_bits=entry["bits_per_transmission"],
             packets_per_slot=(1 / tolerance if law == "duty" else tolerance) if tolerance else None,
+            delay_steps=delay_steps,
         )
 
 
@@ -92,13 +97,16 @@ class Cell:
             "bits_per_transmission": need.payload_bits,
             "tolerance": need.tolerance,
             "tolerance_ci95": None if need.interval is None else sorted(need.interval),
+            "delay_steps": need.delay_steps,
             "reason": None,
         }
         if need.tolerance is None or need.payload_bits is None:
             return row | {"reason": "sees every state, whatever the link does"}
+        if need.payload_bits == 0:
+            return row | {"reason": "sends nothing: as many as there are, without this cell"}
         ends = need.interval or (need.tolerance, need.tolerance)
-        row["devices"] = self._devices(need.tolerance, need.payload_bits, snr_db)
-        row["devices_ci95"] = [self._devices(end, need.payload_bits, snr_db) for end in ends]
+        row["devices"] = self._devices(need, need.tolerance, snr_db)
+        row["devices_ci95"] = [self._devices(need, end, snr_db) for end in ends]
         if need.packets_per_slot is not None:
             row["bits_per_s"] = need.payload_bits * need.packets_per_slot / self.slot_s
             if self.limit_bits_per_s > 0:
@@ -107,11 +115,13 @@ class Cell:
             row["reason"] = self._why_nobody(need.tolerance, need.payload_bits, snr_db)
         return row
 
-    def _devices(self, tolerance: float, payload_bits: int, snr_db: float) -> int:
-        link = (payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
+    def _devices(self, need: Need, tolerance: float, snr_db: float) -> int:
+        link = (need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
         if self.law == "equal":
             return int(equal_devices(tolerance, *link, noise=self.noise))
         c = slot_capacity(*link)
+        if need.delay_steps:  # the tolerance was measured with packets that late
+            return int(duty_devices(tolerance, c))
         # A packet that is late on arrival has used up that much of the gap it could have bridged.
         return int(duty_devices(max(tolerance - float(late_slots(c)), 0.0), c))
 

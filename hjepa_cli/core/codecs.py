@@ -15,8 +15,8 @@ from torch import Tensor
 from hjepa_cli.checks import parse_payload
 from hjepa_cli.core.encoder import normalise
 from hjepa_cli.core.payload import payload_bits, quantise
-from hjepa_cli.core.plant import plant
 from hjepa_cli.core.trajectories import generate
+from hjepa_cli.core.typical import embed_states
 from hjepa_cli.errors import UsageError
 from hjepa_cli.settings import Settings
 
@@ -164,9 +164,4 @@ def _typical_embeddings(model: "Model", settings: Settings) -> Tensor:
     count = states.shape[2]
     pairs = np.stack([states[:, :-1], states[:, 1:]], axis=2).reshape(-1, 2, count)
     pairs = pairs[:: max(1, len(pairs) // FIT_EMBEDDINGS)]
-    camera = plant(model.plant_name).camera()
-    parts = []
-    for start in range(0, len(pairs), 256):
-        frames = camera.render(pairs[start : start + 256].reshape(-1, count).astype(float))
-        parts.append(model.encode(frames.reshape(-1, 2, *frames.shape[1:])))
-    return torch.cat(parts)
+    return embed_states(model, pairs)

@@ -1,13 +1,14 @@
-"""The context encoder Ψ: two camera frames in, one embedding out (paper §III-A).
+"""The context encoder Ψ: camera frames in, one embedding out (paper §III-A).
 
 A residual network with three stages of 64, 128 and 256 channels keeps a 2 × 4 map to its last
 layer, because a cart-pole is where things are: global average pooling would throw the positions
-away. Frames travel as uint8 [N, 2, H, W, 3] (previous, current), which is already channels-last
+away. Frames travel as uint8 [N, κ, H, W, 3], the current one last, which is already channels-last
 memory, the layout the convolutions are fastest in.
 """
 
 import copy
 import math
+from itertools import pairwise
 from typing import Self
 
 import torch
@@ -74,7 +75,7 @@ class ResidualBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Ψ_θ: uint8 frames [N, 2, 64, 128, 3] → embeddings [N, D] of length √D.
+    """Ψ_θ: uint8 frames [N, κ, 64, 128, 3] → embeddings [N, D] of length √D.
 
     Args:
         embedding: D, 256 in the paper.
@@ -87,6 +88,8 @@ class Encoder(nn.Module):
             them little there and the states stay linearly readable (docs/LOG.md).
         symmetric: built so that the embedding of a mirrored picture is the reflected embedding
             (:mod:`hjepa_cli.core.symmetry`); D is even then, and the offset is on the even half.
+        frames: κ. Before the current one lie κ − 1 earlier ones: themselves, or the difference of
+            each frame to the one before it.
     """
 
     input_mean: Tensor
@@ -94,14 +97,20 @@ class Encoder(nn.Module):
     offset: Tensor
 
     def __init__(
-        self, embedding: int, frame_input: str, centre: bool, symmetric: bool = False
+        self,
+        embedding: int,
+        frame_input: str,
+        centre: bool,
+        symmetric: bool = False,
+        frames: int = 2,
     ) -> None:
         super().__init__()
         self.embedding, self.frame_input, self.symmetric = embedding, frame_input, symmetric
-        self.register_buffer("input_mean", torch.zeros(2 * CHANNELS))
-        self.register_buffer("input_std", torch.ones(2 * CHANNELS))
+        channels = frames * CHANNELS
+        self.register_buffer("input_mean", torch.zeros(channels))
+        self.register_buffer("input_std", torch.ones(channels))
         halves = 2 if symmetric else 1
-        self.stem = nn.Conv2d(2 * CHANNELS, STEM_CHANNELS // halves, STEM_PX, STEM_PX, bias=False)
+        self.stem = nn.Conv2d(channels, STEM_CHANNELS // halves, STEM_PX, STEM_PX, bias=False)
         self.stem_norm = _norm(STEM_CHANNELS, symmetric)
         self.stages = nn.Sequential(
             ResidualBlock(STEM_CHANNELS, 64, 2, symmetric=symmetric),
@@ -125,18 +134,22 @@ class Encoder(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def fit_standardisation(self, frames: Tensor) -> None:
-        """Measure per-channel mean and standard deviation of both inputs.
+        """Measure per-channel mean and standard deviation of all inputs.
 
         Args:
-            frames: uint8 [N, 2, 64, 128, 3], (previous, current).
+            frames: uint8 [N, κ, 64, 128, 3].
         """
-        flat = self._inputs(frames).permute(0, 2, 3, 1).reshape(-1, 2 * CHANNELS).float()
+        inputs = self.inputs(frames)
+        flat = inputs.permute(0, 2, 3, 1).reshape(-1, inputs.shape[1]).float()
         self.input_mean.copy_(flat.mean(0))
         self.input_std.copy_(flat.std(0).clamp_min(1e-3))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """uint8 frames [N, 2, 64, 128, 3] → float32 embeddings [N, D]."""
-        x = self._inputs(frames)
+        """uint8 frames [N, κ, 64, 128, 3] → float32 embeddings [N, D]."""
+        return self.embed(self.inputs(frames))
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Inputs [N, 3κ, 64, 128] as of :meth:`inputs` → float32 embeddings [N, D]."""
         if not torch.is_autocast_enabled(x.device.type):
             x = x.float()
         x = F.relu(self.stem_norm(F.conv2d(x, *self._stem(), stride=STEM_PX)))
@@ -149,7 +162,7 @@ class Encoder(nn.Module):
         """A copy for inference, with all batch norms inside the convolutions: same z, sooner."""
         frozen = copy.deepcopy(self).eval()
         weight, offset = frozen._stem()
-        frozen.stem = nn.Conv2d(2 * CHANNELS, STEM_CHANNELS, STEM_PX, STEM_PX).eval()
+        frozen.stem = nn.Conv2d(weight.shape[1], STEM_CHANNELS, STEM_PX, STEM_PX).eval()
         frozen.stem.weight, frozen.stem.bias = nn.Parameter(weight), nn.Parameter(offset)
         _fold(frozen, "stem", "stem_norm")
         frozen.input_mean.zero_()
@@ -171,12 +184,17 @@ class Encoder(nn.Module):
             weight, offset = torch.cat([weight, weight.flip(-1)]), torch.cat([offset, offset])
         return weight, offset
 
-    def _inputs(self, frames: Tensor) -> Tensor:
-        """Both inputs [N, 6, H, W] in bfloat16: pixels and their differences are exact in it."""
-        previous, current = frames[:, 0].bfloat16(), frames[:, 1].bfloat16()
-        second = current - previous if self.frame_input == "difference" else previous
+    def inputs(self, frames: Tensor) -> Tensor:
+        """What the network sees of frames [N, κ, 64, 128, 3]: [N, 3κ, 64, 128], the present first.
+
+        In bfloat16: pixels and their differences are exact in it.
+        """
+        seen = [frame.bfloat16() for frame in reversed(frames.unbind(1))]
+        earlier = seen[1:]
+        if self.frame_input == "difference":
+            earlier = [later - before for later, before in pairwise(seen)]
         # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.
-        return torch.cat([current, second], dim=-1).permute(0, 3, 1, 2)
+        return torch.cat([seen[0], *earlier], dim=-1).permute(0, 3, 1, 2)
 
 
 def _conv(

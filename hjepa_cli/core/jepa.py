@@ -77,7 +77,11 @@ class Jepa:
         assert terms.keys() == self.weights.keys(), (sorted(terms), sorted(self.weights))
         return torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
 
-    def update_target(self) -> None:
+    def train(self) -> None:
+        """Put the encoder into training mode; the others never leave it."""
+        self.encoder.train()
+
+    def after_step(self) -> None:
         """Move the target encoder after an optimiser step."""
         self.target.update(self.encoder)
 

@@ -2,8 +2,8 @@
 
 One step k of every loop, in this order:
 
-1. a device that transmits at k senses its state (frames k - 1 and k, or the true state) and the
-   controller receives the packet, without delay;
+1. a device that transmits at k senses its state (its last frames, or the true state) and the
+   controller receives the packet, without delay unless it takes longer than a slot;
 2. the controller picks the force u_k, from packets alone;
 3. step k is scored on the state x_k and the force u_k;
 4. the plant moves to x_{k+1} under u_k and process noise.
@@ -12,11 +12,13 @@ Devices N and curve points P (different link schedules on the same draws) share 
 """
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
 
+from hjepa_cli.core.history import LONGEST, frames_seen
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.system import Bools, Floats, System
 from hjepa_cli.errors import NumericalError, UsageError
@@ -43,8 +45,12 @@ class Controller(Protocol):
         ...
 
 
-Sensor = Callable[[Floats, Floats], Any]
-"""The device side: previous states [m, S], current states [m, S] → packets [m, ...]."""
+Sensor = Callable[[Floats], Any]
+"""The device side: the last states of m devices [m, 4, S], the present one last → packets [m, ...].
+
+Those before a device was switched on are copies of its first; see
+:func:`~hjepa_cli.core.history.frames_seen`.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,6 +198,7 @@ def simulate(
     controller: Controller,
     sensor: Sensor,
     *,
+    delay_steps: int = 0,
     tick: Callable[[], None] = lambda: None,
     watch: Callable[[int, Floats, Floats], None] = lambda k, states, forces_n: None,
 ) -> Outcome:
@@ -203,6 +210,7 @@ def simulate(
         delivered: link schedules [P, steps, N]; see :func:`gap_schedule`.
         controller: drives P · N devices, point by point; in its initial state.
         sensor: turns states into packets.
+        delay_steps: how long a packet is under way.
         tick: called after every step, for progress.
         watch: called at every step with k, states [P · N, S] and applied forces [P · N, *A].
 
@@ -216,9 +224,12 @@ def simulate(
     )
     noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
     world = World(plant, initial, mass_scale, noise)
+    nothing = np.zeros(points * devices, dtype=bool), None
+    under_way = deque([nothing] * delay_steps)
     for k in range(steps):
         states, sent = world.states, delivered[:, k].reshape(-1)
-        watch(k, states, world.move(controller.act(sent, world.sense(sensor, sent))))
+        under_way.append((sent, world.sense(sensor, sent)))
+        watch(k, states, world.move(controller.act(*under_way.popleft())))
         tick()
     shape = (points, devices)
     return Outcome(world.score.reshape(shape) / steps, world.cost.reshape(shape) / steps)
@@ -245,16 +256,17 @@ class World:
         self._plant, self._noise = plant, noise
         self._plants = plant.simulation(devices, mass_scale=mass_scale)
         self._plants.states = initial
-        self._previous = self._plants.states
+        switched_on = [self._plants.states] * (LONGEST - 1)
         self._plants.step(plant.no_force(devices))
         self.states = self._plants.states
+        self._seen = deque([*switched_on, self.states], maxlen=LONGEST)
         self.score, self.cost, self._step = np.zeros(devices), np.zeros(devices), 0
 
     def sense(self, sensor: Sensor, devices: Bools) -> Any:
         """Packets of some devices; ``None`` where there are none."""
         if not devices.any():
             return None
-        return sensor(self._previous[devices], self.states[devices])
+        return sensor(np.stack([states[devices] for states in self._seen], axis=1))
 
     def move(self, forces_n: Floats) -> Floats:
         """Score this step and go on to the next; returns the forces as applied [N, *A].
@@ -267,18 +279,27 @@ class World:
         forces_n = np.clip(forces_n, -self._plant.force_limit_n, self._plant.force_limit_n)
         self.score += self._plant.in_band(self.states)
         self.cost += self._plant.cost(self.states, forces_n)
-        self._previous = self.states
         self._plants.step(forces_n)
         moved = self._plants.states + next(self._noise)
         self._plants.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
         self.states = self._plants.states
+        self._seen.append(self.states)
         self._step += 1
         return forces_n
 
 
-def play(controller: Controller, packets: Any, devices: int, steps: int) -> Floats:
-    """What a controller plays after a single packet at k = 0: forces [devices, steps, *A]."""
+def last_states(rollouts: Floats, k: int) -> Floats:
+    """What a sensor gets in step k of rollouts [R, steps + 1, S], whose index 0 is before k = 0."""
+    return rollouts[:, frames_seen(k, LONGEST)]
+
+
+def play(
+    controller: Controller, packets: Any, devices: int, steps: int, *, delay_steps: int = 0
+) -> Floats:
+    """What a controller plays after a single packet, sent at k = 0: forces [devices, steps, *A]."""
     arrives = np.ones(devices, dtype=bool)
-    forces = [controller.act(arrives, packets)]
-    forces += [controller.act(~arrives, None) for _ in range(steps - 1)]
+    forces = [
+        controller.act(*((arrives, packets) if k == delay_steps else (~arrives, None)))
+        for k in range(steps)
+    ]
     return np.stack(forces, axis=1)

@@ -1,8 +1,9 @@
 """What each method name means: what its devices send, and what its controller does with it.
 
 Methods on embeddings send Ψ(previous frame, current frame), really rendered, encoded, quantised
-and dequantised. Methods on the true state are anchors: what prediction could gain at best
-(``oracle``), what it has to beat (``hold-true``, ``zero-true``), and the teacher (``optimal``).
+and dequantised. Methods on raw frames send the pictures. Methods on the true state are anchors: what
+prediction could gain at best (``oracle``), what it has to beat (``hold-true``, ``zero-true``), and
+the teacher (``optimal``).
 """
 
 import dataclasses
@@ -11,23 +12,27 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.checks import RAW_FRAMES, TRUE_STATE, late, split_late
 from hjepa_cli.core.codecs import Codec, bits_of, build_codec
-from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
+from hjepa_cli.core.controllers import LastForce, Oracle, Planner, StrideController
 from hjepa_cli.core.disagreement import TwoLevels
+from hjepa_cli.core.encoder import CHANNELS, HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.kalman import KalmanController, fit_state_reader
+from hjepa_cli.core.linear_latent import LinearPlanner, fit_linear_latent
 from hjepa_cli.core.loop import Controller, Sensor
 from hjepa_cli.core.plant import plant
-from hjepa_cli.core.system import Floats, System
+from hjepa_cli.core.sensors import camera_sensor, embedding_sensor, true_state
+from hjepa_cli.core.system import System
 from hjepa_cli.errors import UsageError
 from hjepa_cli.settings import Settings
 
 if TYPE_CHECKING:
     from hjepa_cli.core.model import Model
 
-SENSOR_BATCH = 256  # frame pairs rendered and encoded at a time: 12 MiB
+FRAME_BITS = HEIGHT_PX * WIDTH_PX * CHANNELS * 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +46,9 @@ class Method:
         reactive: builds one that only acts on packets, for links that deliver at every step.
         bits_per_transmission: what a transmission costs.
         family: methods of one family play the same when a packet arrives at every step.
-        uses_link: ``False`` for ``optimal``, which sees every state whatever the link does.
+        uses_link: ``False`` for ``optimal`` and ``local``, which need none.
         two_levels: builds the controller with a second level beside it, where the method has two.
+        delay_steps: how long its packets are under way.
     """
 
     name: str
@@ -53,21 +59,39 @@ class Method:
     family: str
     uses_link: bool = True
     two_levels: Callable[[int], TwoLevels] | None = None
+    delay_steps: int = 0
 
 
 def build_method(name: str, settings: Settings, model: "Model | None") -> Method:
-    """Any method by its name, as the settings want it.
+    """Any method by its name, on time or :func:`~hjepa_cli.checks.late`, as the settings want it.
 
     Raises:
         UsageError: there is no model that holds it.
     """
+    name, steps = split_late(name)
+    method = _build_method(name, settings, model)
+    return dataclasses.replace(method, family=late(method.family, steps), delay_steps=steps)
+
+
+def _build_method(name: str, settings: Settings, model: "Model | None") -> Method:
     payload = settings.protocol.payload
     if name in TRUE_STATE:
         sent = bits_of(payload, settings.encoder.embedding)
         return true_state_method(name, plant(settings.plant), sent)
-    if model is None:
-        raise UsageError(f"method '{name}' needs a model", hint="hjepa train-hierarchy")
-    return embedding_method(name, model, build_codec(payload, model, settings))
+    if model is None or name not in model.methods:
+        raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")
+    if name in RAW_FRAMES:
+        return frames_method(name, model)
+    if name == "local":
+        return local_method(model)
+    if name in ("state-kf", "state-48"):
+        return filtered_method(name, model, settings)
+    codec = build_codec(payload, model, settings)
+    if name == "linear":
+        latent = fit_linear_latent(model, settings)
+        planner = LinearPlanner(latent, model.actor, model.force_limit_n)
+        return embedding_method(name, model, codec, planner)
+    return embedding_method(name, model, codec)
 
 
 def true_state_method(name: str, kind: System, bits_per_transmission: int) -> Method:
@@ -92,8 +116,10 @@ def true_state_method(name: str, kind: System, bits_per_transmission: int) -> Me
     return Method(name, true_state, build, reactive, bits_per_transmission, "state", uses_link)
 
 
-def embedding_method(name: str, model: "Model", codec: Codec) -> Method:
-    """A method that lives on a trained model's embeddings.
+def embedding_method(
+    name: str, model: "Model", codec: Codec, planner: Planner | None = None
+) -> Method:
+    """A method that lives on a trained model's embeddings, with a planner of its own if given one.
 
     Raises:
         UsageError: the model does not hold this method.
@@ -104,33 +130,42 @@ def embedding_method(name: str, model: "Model", codec: Codec) -> Method:
     if name == "zero":
         build = functools.partial(last_force, keep=False)
     elif name != "hold":
-        planner, shape = model.planner(name), model.action_shape
+        planner, shape = planner or model.planner(name), model.action_shape
         build = functools.partial(StrideController, planner, action_shape=shape)
     sensor = embedding_sensor(model, codec)
     two_levels = functools.partial(_two_levels, model) if name == "hjepa" else None
     return Method(name, sensor, build, reactive, codec.bits, "embedding", two_levels=two_levels)
 
 
-def true_state(previous: Floats, states: Floats) -> Floats:
-    """Sensor: the state itself, exact."""
-    return states
+def frames_method(name: str, model: "Model") -> Method:
+    """A baseline whose controller receives camera frames, acts on them and holds the force."""
+
+    def act(frames: NDArray[np.uint8]) -> Tensor:
+        return model.actor(model.encode(frames).to(model.device))
+
+    build = functools.partial(LastForce, act, keep=True, action_shape=model.action_shape)
+    return Method(name, camera_sensor(model), build, build, model.frames * FRAME_BITS, name)
 
 
-def embedding_sensor(model: "Model", codec: Codec) -> Callable[[Floats, Floats], Tensor]:
-    """Sensor: render the last two frames, encode, send through the codec."""
-    camera = plant(model.plant_name).camera()
+def local_method(model: "Model") -> Method:
+    """The actor on the device, at every step on what the camera shows: nothing is sent."""
+    shape, sensor = model.action_shape, embedding_sensor(model, None)
+    build = functools.partial(LastForce, model.actor, keep=True, action_shape=shape)
+    return Method("local", sensor, build, build, 0, "local", uses_link=False)
 
-    def sense(previous: Floats, states: Floats) -> Tensor:
-        """States [m, S] one step before and now → received embeddings [m, D]."""
-        pairs = np.stack([previous, states], axis=1)
-        received = []
-        for start in range(0, len(pairs), SENSOR_BATCH):
-            frames = camera.render(pairs[start : start + SENSOR_BATCH].reshape(-1, states.shape[1]))
-            z = model.encode(frames.reshape(-1, 2, *frames.shape[1:]))
-            received.append(codec.send(z))
-        return torch.cat(received).to(model.device)
 
-    return sense
+def filtered_method(name: str, model: "Model", settings: Settings) -> Method:
+    """``state-kf`` decodes states at the controller, ``state-48`` on the device."""
+    reader, kind = fit_state_reader(model, settings), plant(model.plant_name)
+    controls = kind.teacher(), kind.force_limit_n
+    if name == "state-kf":
+        codec = build_codec(settings.protocol.payload, model, settings)
+        build = functools.partial(KalmanController, reader.filter, reader.read, *controls)
+        return Method(name, embedding_sensor(model, codec), build, build, codec.bits, name)
+    fresh = embedding_sensor(model, None)
+    build = functools.partial(KalmanController, reader.quantised, np.asarray, *controls)
+    sensor: Sensor = lambda seen: reader.codec.send(reader.read(fresh(seen)))  # noqa: E731
+    return Method(name, sensor, build, build, reader.codec.bits, name)
 
 
 def _two_levels(model: "Model", devices: int) -> TwoLevels:

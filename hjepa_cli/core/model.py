@@ -1,8 +1,9 @@
-"""A trained model: encoder, predictors and actor in one object, as a checkpoint holds them."""
+"""A trained model: all networks that drive devices in one object, as a checkpoint holds them."""
 
 import copy
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hjepa_cli.checks import ANCHORS
 from hjepa_cli.core.actor import Actor
 from hjepa_cli.core.controllers import Planner
+from hjepa_cli.core.decoder import Decoder
 from hjepa_cli.core.encoder import Encoder
+from hjepa_cli.core.frame_policies import read_frames
 from hjepa_cli.core.hierarchy import Strides, build_predictors, hold, plan_stride
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.training import autocast, compute_dtype, resolve_device
@@ -23,14 +27,20 @@ from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkp
 
 ENCODE_BATCH = 64  # larger ones fall out of the caches
 CHOICES = {  # of an architecture; its other values are sizes
-    "kind": ("encoder", "hierarchy"),
+    "kind": ("encoder", "hierarchy", "flat", "supervised", "autoencoder"),
     "frame_input": ("difference", "pair"),
+    "frames": (2, 4),
     "stride_actions": ("all", "held"),
     "centre": (True, False),
     "residual": (True, False),
     "mirror": ("exact", "augment", "none"),
 }
 PRECISIONS = ("auto", "bf16", "fp32")
+LEVELS = {  # of each kind that has some, in the order of the checkpoint
+    "encoder": ("high",),
+    "hierarchy": ("high", "medium", "low", "flat"),
+    "flat": ("high", "flat"),
+}
 
 
 def build_modules(
@@ -40,31 +50,60 @@ def build_modules(
 ) -> nn.ModuleDict:
     """Instantiate the networks that ``architecture`` (checkpoint metadata) describes, untrained.
 
-    ``kind`` "encoder" has Ψ and its companion P^H; "hierarchy" has Ψ, all levels and the actor.
-    ``action_shape`` and ``force_signs`` are the plant's.
+    ``action_shape`` and ``force_signs`` are the plant's. By ``kind``:
+
+    - ``encoder``: Ψ and its companion P^H;
+    - ``hierarchy``: Ψ, all levels, the flat baseline and the actor;
+    - ``flat``: Ψ, a predictor of stride h, the one of stride 1 and the actor;
+    - ``supervised``: Ψ, of κ frames, and the actor;
+    - ``autoencoder``: Ψ, the decoder, a second Ψ that reads what was decoded, and the actor.
     """
-    embedding, hidden = architecture["embedding"], architecture["hidden"]
-    strides = Strides(architecture["h"], architecture["m"], architecture["l"])
+    kind, embedding = architecture["kind"], architecture["embedding"]
     symmetric = architecture["mirror"] == "exact"
     mirror = force_signs if symmetric else None
-    frame_input, centre = architecture["frame_input"], architecture["centre"]
-    modules = nn.ModuleDict({"encoder": Encoder(embedding, frame_input, centre, symmetric)})
-    predictors = build_predictors(
-        strides,
-        embedding,
-        hidden,
-        all_actions=architecture["stride_actions"] == "all",
-        residual=architecture["residual"],
-        forces=math.prod(action_shape),
-        mirror=mirror,
-    )
-    if architecture["kind"] == "encoder":
-        modules["high"] = predictors["high"]
-        return modules
-    modules.update(predictors)
-    hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
-    modules["actor"] = Actor(embedding, hidden, dropout, action_shape, mirror)
+    frames = architecture.get("frames", 2)
+
+    def encoder() -> Encoder:
+        frame_input, centre = architecture["frame_input"], architecture["centre"]
+        return Encoder(embedding, frame_input, centre, symmetric, frames)
+
+    modules = nn.ModuleDict({"encoder": encoder()})
+    if kind in LEVELS:
+        predictors = build_predictors(
+            Strides(architecture["h"], architecture["m"], architecture["l"]),
+            embedding,
+            architecture["hidden"],
+            all_actions=architecture["stride_actions"] == "all",
+            residual=architecture["residual"],
+            forces=math.prod(action_shape),
+            mirror=mirror,
+        )
+        modules.update({name: predictors[name] for name in levels_of(architecture)})
+    if kind == "autoencoder":
+        modules["decoder"] = Decoder(embedding, frames, symmetric)
+        modules["reader"] = encoder()
+    if kind != "encoder":
+        hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
+        modules["actor"] = Actor(embedding, hidden, dropout, action_shape, mirror)
     return modules
+
+
+def levels_of(architecture: Mapping[str, Any]) -> tuple[str, ...]:
+    """The predictors of an architecture; a flat one of stride 1 has one for both its levels."""
+    levels = LEVELS[architecture["kind"]]
+    return levels[1:] if (architecture["kind"], architecture["h"]) == ("flat", 1) else levels
+
+
+def offered(architecture: Mapping[str, Any], states: int = 4) -> tuple[str, ...]:
+    """The methods that a model of this architecture can drive a plant of S states with."""
+    kind, h = architecture["kind"], architecture.get("h")
+    if kind == "encoder":
+        return ()
+    if kind not in LEVELS:
+        return (f"{kind}-{architecture['frames']}",)
+    planned = dict.fromkeys((f"ts-jepa-{h}", "ts-jepa-1"))  # once where h is 1
+    anchors = [name for name in ANCHORS if name != "state-48" or states == 4]
+    return (*(("hjepa",) if kind == "hierarchy" else ()), *planned, "hold", "zero", *anchors)
 
 
 def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
@@ -115,7 +154,11 @@ def check_metadata(checkpoint: Checkpoint) -> Mapping[str, Any]:
             isinstance(metadata["plant"], str)
             and isinstance(metadata["health"], dict)
             and metadata["settings"]["encoder"]["precision"] in PRECISIONS
-            and all(metadata["architecture"][name] in allowed for name, allowed in CHOICES.items())
+            and metadata["architecture"]["kind"] in CHOICES["kind"]
+            and all(
+                value in CHOICES.get(name, (value,))
+                for name, value in metadata["architecture"].items()
+            )
         )
         plant(metadata["plant"])
     except (KeyError, TypeError, ValueError, UsageError):
@@ -135,9 +178,13 @@ def tensors_of(modules: nn.ModuleDict) -> dict[str, NDArray[Any]]:
 
 @torch.inference_mode()
 def encode_frames(
-    encoder: nn.Module, frames: Tensor, *, device: torch.device, precision: str
+    encoder: Callable[[Tensor], Tensor],
+    frames: Tensor,
+    *,
+    device: torch.device,
+    precision: str,
 ) -> Tensor:
-    """uint8 frames [N, 2, H, W, 3] → float32 embeddings [N, D] on the CPU, in batches."""
+    """uint8 frames [N, κ, H, W, 3] → float32 embeddings [N, D] on the CPU, in batches."""
     parts = []
     for start in range(0, len(frames), ENCODE_BATCH):
         batch = frames[start : start + ENCODE_BATCH].to(device)
@@ -149,7 +196,9 @@ def encode_frames(
 def for_inference(modules: nn.ModuleDict, device: torch.device, precision: str) -> nn.ModuleDict:
     """A copy that computes the same sooner: batch norms folded, weights cast once for all calls."""
     networks = copy.deepcopy(modules).to(device).eval()
-    networks["encoder"] = networks["encoder"].folded()  # type: ignore[operator]
+    for name, network in networks.items():
+        if isinstance(network, Encoder):
+            networks[name] = network.folded()
     dtype = compute_dtype(device, precision)
     for layer in networks.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
@@ -158,7 +207,7 @@ def for_inference(modules: nn.ModuleDict, device: torch.device, precision: str) 
 
 
 class Model:
-    """Everything inference needs, from one hierarchy checkpoint."""
+    """Everything inference needs, from one checkpoint that drives."""
 
     def __init__(
         self, modules: nn.ModuleDict, metadata: Mapping[str, Any], digest: str, device: str = "auto"
@@ -169,22 +218,25 @@ class Model:
         self.precision: str = metadata["settings"]["encoder"]["precision"]
         kind = plant(self.plant_name)
         self.force_limit_n, self.action_shape = kind.force_limit_n, kind.action_shape
-        self.strides = Strides(*(self.architecture[name] for name in ("h", "m", "l")))
+        self.frames: int = self.architecture.get("frames", 2)
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
-        self._planners: dict[str, Planner] = {
-            "hjepa": _Hierarchical(self),
-            f"ts-jepa-{self.strides.h}": _Flat(self, "high", self.strides.h),
-            "ts-jepa-1": _Flat(self, "flat", 1),
-        }
+        self._planners: dict[str, Planner] = {}
+        levels = levels_of(self.architecture) if self.architecture["kind"] in LEVELS else ()
+        if "medium" in levels:
+            self._planners["hjepa"] = _Hierarchical(self)
+        if "high" in levels:
+            self._planners[f"ts-jepa-{self.strides.h}"] = _Flat(self, "high", self.strides.h)
+        if "flat" in levels:
+            self._planners["ts-jepa-1"] = _Flat(self, "flat", 1)
 
     @classmethod
     def load(cls, path: Path, device: str = "auto") -> "Model":
-        """Read a hierarchy checkpoint.
+        """Read a checkpoint.
 
         Raises:
             MissingInputError: no such file.
-            DataError: not an intact hierarchy checkpoint.
+            DataError: not an intact checkpoint that drives: of a lone encoder, for example.
         """
         checkpoint = load_checkpoint(path)
         architecture = checkpoint.metadata.get("architecture")
@@ -198,12 +250,17 @@ class Model:
     @property
     def methods(self) -> tuple[str, ...]:
         """What this model can drive; P^H alone is TS-JEPA of depth h."""
-        return (*self._planners, "hold", "zero")
+        return offered(self.architecture, len(plant(self.plant_name).state_names))
+
+    @property
+    def strides(self) -> Strides:
+        """Of a model with predictors."""
+        return Strides(*(self.architecture[name] for name in ("h", "m", "l")))
 
     def encode(self, frames: NDArray[np.uint8]) -> Tensor:
-        """Frames uint8 [N, 2, 64, 128, 3] (previous, current) → embeddings float32 [N, D]."""
+        """Frames uint8 [N, κ, 64, 128, 3], the current one last → embeddings float32 [N, D]."""
         return encode_frames(
-            self.networks["encoder"],
+            functools.partial(read_frames, self.networks),
             torch.from_numpy(frames),
             device=self.device,
             precision=self.precision,

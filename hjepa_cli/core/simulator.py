@@ -80,6 +80,7 @@ class Simulator:
             schedules,
             build(loops),
             method.sensor,
+            delay_steps=method.delay_steps,
             tick=lambda: tick(loops),
         )
 

@@ -201,3 +201,9 @@ def flatten_twins(x: Tensor) -> Tensor:
     """Feature maps of twins [N, C, H, W] → twins [N, C · H · W] in no place: none is flipped."""
     right, left = x.chunk(2, dim=1)
     return torch.cat([right.flatten(1), left.flip(-1).flatten(1)], dim=-1)
+
+
+def unflatten_twins(x: Tensor, channels: int, height: int, width: int) -> Tensor:
+    """The inverse of :func:`flatten_twins`: twins [N, C · H · W] → maps of twins [N, C, H, W]."""
+    right, left = x.unflatten(1, (channels, height, width)).chunk(2, dim=1)
+    return torch.cat([right, left.flip(-1)], dim=1)

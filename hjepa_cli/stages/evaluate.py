@@ -4,101 +4,35 @@ A trained model (a run's or the zoo's) → closed-loop curves of every method, k
 all they depend on, and tables. ``scale`` takes the same curves through :func:`curves_for`.
 """
 
-import dataclasses
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import TRUE_STATE, check_methods
+from hjepa_cli.checks import check_methods, split_late
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import WINDOWS
-from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant, plant_of
+from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.core.workers import cluster_runner, open_workers, single_thread
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import UsageError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
-from hjepa_cli.storage import curves, runs, zoo
-from hjepa_cli.storage.checkpoints import MODEL_FILE
-from hjepa_cli.storage.curves import Digest, Entry
-from hjepa_cli.storage.datasets import Dataset, load_dataset
+from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
+from hjepa_cli.storage import curves, runs
+from hjepa_cli.storage.curves import Entry
 from hjepa_cli.storage.runs import Run
 from hjepa_cli.storage.zoo import CURVES_FILE
 
 MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods
 USUAL_ROUNDS = 5  # of the search for tolerances, for the progress bar
 WORTH_WORKERS = 50_000  # device-steps per point; below, processes cost more than they bring
-
-
-@dataclasses.dataclass(frozen=True)
-class Subject:
-    """What is evaluated: a model, if there is one, and the rollouts its NMAE is taken on.
-
-    Attributes:
-        settings: plant, seed, protocol.
-        model: ``None`` when only true-state methods can be measured.
-        path: the model's file.
-        dataset: whose clean rollouts to use; ``None`` makes them again from the settings.
-    """
-
-    settings: Settings
-    model: Model | None
-    path: Path | None
-    dataset: Dataset | None
-
-    @property
-    def name(self) -> str:
-        """The model's path, for people."""
-        return str(self.path) if self.path else "no model"
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """All methods that can be measured."""
-        return (*(self.model.methods if self.model else ()), *TRUE_STATE)
-
-    def measurable(self, methods: Sequence[str]) -> list[str]:
-        """Those of ``methods`` that can be measured, in their order."""
-        return [name for name in methods if name in self.methods]
-
-    @property
-    def digest(self) -> Digest:
-        """What curves must have been measured with to be this subject's."""
-        return Digest.of(
-            self.model.digest if self.model else None,
-            self.settings,
-            self.dataset.settings if self.dataset else None,
-        )
-
-    def inputs(self, **flags: bool) -> dict[str, Any]:
-        """What a run of this subject was given, for :meth:`Run.create`."""
-        given: dict[str, Any] = dict(flags)
-        if self.model and self.path:
-            given["checkpoint"] = runs.describe_input(self.path, self.model.digest)
-        if self.dataset:
-            given["dataset"] = runs.describe_input(self.dataset.path, self.dataset.digest)
-        return given
-
-    @property
-    def beside(self) -> list[Path]:
-        """Where the model's own curves are; the zoo's are never written, a run's are."""
-        return [self.path.with_name(CURVES_FILE)] if self.path else []
-
-    def skipped(self, methods: Sequence[str]) -> dict[str, str]:
-        """The methods without a model, with what would train it."""
-        return {name: _how_to_train(name, self) for name in methods if name not in self.methods}
-
-    def say_skipped(self, methods: Sequence[str], screen: Screen) -> None:
-        """Tell the user about them."""
-        for name, how in self.skipped(methods).items():
-            screen.say(f"{name} skipped, no model of it here: {how}")
 
 
 def run(
@@ -109,6 +43,7 @@ def run(
     dataset: Path | None = None,
     out: Path | None = None,
     remeasure: bool = False,
+    further: Sequence[Path] | None = None,
 ) -> dict[str, Any]:
     """Evaluate ``settings.methods``; returns the document of ``--json``.
 
@@ -120,6 +55,7 @@ def run(
         dataset: take the clean rollouts for the NMAE from here instead of making them again.
         out: run directory; an interrupted one is continued after the last finished method.
         remeasure: do not use cached curves.
+        further: models of methods that the first one does not hold; ``None`` looks for them.
 
     Raises:
         UsageError: unknown method.
@@ -127,7 +63,7 @@ def run(
         DataError: a damaged file, or one of another plant.
     """
     check_methods(settings.methods)
-    subject = open_subject(settings, screen, checkpoint, dataset)
+    subject = open_subject(settings, screen, checkpoint, dataset, further)
     inputs = subject.inputs(remeasure=remeasure)
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
         result = record.result
@@ -140,49 +76,80 @@ def run(
 
 
 def curves_for(
-    subject: Subject, screen: Screen, record: Run, *, remeasure: bool = False
+    subject: Subject,
+    screen: Screen,
+    record: Run,
+    *,
+    remeasure: bool = False,
+    methods: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Take the curves of the settings' methods that are cached, measure the rest, keep each.
+
+    Every curve is kept under the digest of the model that it was measured with, in a file of that
+    model beside the checkpoint and in the run.
 
     Args:
         subject: what is evaluated.
         record: the run, of ``eval`` or ``scale``, that keeps them.
         remeasure: do not use cached curves; those of this very run, interrupted, are kept.
+        methods: others than the settings', some perhaps late.
 
     Returns:
         The document of ``eval --json``. Methods without a model are left out, and said.
     """
-    settings, methods = subject.settings, subject.settings.methods
-    subject.say_skipped(methods, screen)
-    own = record.path(CURVES_FILE)
-    found = {} if remeasure else cached(subject)
-    found |= {name: (entry, own) for name, entry in curves.read(own, subject.digest).items()}
+    settings = subject.settings
+    subject.say_skipped(settings.methods, screen)
+    methods = subject.measurable(settings.methods) if methods is None else methods
+    found: dict[str, tuple[Entry, Path]] = {}
+    for one, names in subject.shared_out(methods):
+        found |= _curves_of(one, names, screen, record, remeasure=remeasure, first=one is subject)
+    paths = {name: subject.of(name).path for name in methods}
+    return {
+        "checkpoint": subject.path,
+        "checkpoints": {name: path for name, path in paths.items() if path},
+        "plant": settings.plant,
+        "seed": settings.seed,
+        "acceptable_score": settings.protocol.acceptable_score,
+        "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
+        "horizon": list(range(settings.protocol.horizon + 1)),
+        "methods": {name: found[name][0] for name in methods},
+        "skipped": subject.skipped(settings.methods),
+        "curves": record.path(CURVES_FILE),
+        "source": _source(found),
+    }
+
+
+def _curves_of(
+    subject: Subject,
+    methods: Sequence[str],
+    screen: Screen,
+    record: Run,
+    *,
+    remeasure: bool,
+    first: bool,
+) -> dict[str, tuple[Entry, Path]]:
+    """The curves of methods that this subject's own model holds, and where they are."""
+    own = record.path(CURVES_FILE if first else curves.further_file(subject.digest))
+    found = {} if remeasure else curves.find(subject.digest, methods, subject.beside)
+    kept = curves.read(own, subject.digest)
+    found |= {name: (kept[name], own) for name in methods if name in kept}
     keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
-    missing = [name for name in subject.measurable(methods) if name not in found]
+    missing = [name for name in methods if name not in found]
     for name, entry in _measure(subject, screen, missing) if missing else ():
         for path in keep:
             curves.write(path, subject.digest, {name: entry})
         record.event("measured", method=name)
         found[name] = (entry, own)
     curves.write(own, subject.digest, {name: entry for name, (entry, _) in found.items()})
-    return {
-        "checkpoint": subject.path,
-        "plant": settings.plant,
-        "seed": settings.seed,
-        "acceptable_score": settings.protocol.acceptable_score,
-        "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
-        "horizon": list(range(settings.protocol.horizon + 1)),
-        "methods": {name: found[name][0] for name in methods if name in found},
-        "skipped": subject.skipped(methods),
-        "curves": own,
-        "source": _source(found),
-    }
+    return found
 
 
 def cached(subject: Subject) -> dict[str, tuple[Entry, Path]]:
     """The curves of the settings' methods that were measured before, and where they are."""
-    methods = subject.measurable(subject.settings.methods)
-    return curves.find(subject.digest, methods, subject.beside)
+    found: dict[str, tuple[Entry, Path]] = {}
+    for one, names in subject.shared_out(subject.measurable(subject.settings.methods)):
+        found |= curves.find(one.digest, names, one.beside)
+    return found
 
 
 def measure_points(
@@ -203,35 +170,22 @@ def measure_points(
         UsageError: the method cannot be measured.
     """
     settings = subject.settings
-    if method not in subject.methods:
+    if split_late(method)[0] not in subject.methods:
         raise UsageError(
             f"no model for method '{method}'; choose from {', '.join(subject.methods)}",
-            hint=_how_to_train(method, subject),
+            hint=how_to_train(method, settings),
         )
     points = [Point("gap", gap) for gap in gaps]
     points += [Point("delivery", 1 / p) for p in probabilities]
     devices = settings.protocol.bracket_devices
     device_steps = (len(points) + 1) * _device_steps(settings)
-    with _runner(subject) as runner, _ticking(screen, f"verify {method}", device_steps) as tick:
+    with (
+        _runner(subject.of(method)) as runner,
+        _ticking(screen, f"verify {method}", device_steps) as tick,
+    ):
         bench = Bench(settings.protocol, settings.seed, runner, tick)
         outcome = bench.measure(method, points, devices)
     return bench.reference.describe(points, outcome)
-
-
-def open_subject(
-    settings: Settings, screen: Screen, checkpoint: str | None, dataset: Path | None
-) -> Subject:
-    """Load what is to be evaluated, and say which model it is where the user did not."""
-    plant_of(settings)
-    path = zoo.resolve_model(checkpoint) if checkpoint else _default_model(settings, screen)
-    model = Model.load(path, settings.device) if path else None
-    if model and model.plant_name != settings.plant:
-        raise DataError(
-            f"model {path} drives plant {model.plant_name}, not {settings.plant}",
-            hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
-        )
-    data = load_dataset(dataset, settings.plant) if dataset else None
-    return Subject(settings, model, path, data)
 
 
 def show(result: dict[str, Any], screen: Screen) -> None:
@@ -279,6 +233,9 @@ def show(result: dict[str, Any], screen: Screen) -> None:
             for name, entry in entries.items()
         ],
     )
+    for name, path in result.get("checkpoints", {}).items():
+        if path != result["checkpoint"]:
+            screen.say(f"{name} is of model {path}")
     screen.say(result["source"])
 
 
@@ -348,43 +305,9 @@ def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:
     return rollouts.states.astype("float64"), rollouts.teacher_n.astype("float64")
 
 
-def _default_model(settings: Settings, screen: Screen) -> Path | None:
-    """The newest finished run of the plant, else the zoo's with the settings' strides."""
-
-    def fits(directory: Path) -> bool:
-        return bool(runs.read_config(directory).get("plant") == settings.plant)
-
-    directory = runs.newest_run("train-hierarchy", fits)
-    if directory:
-        screen.say(f"model of the newest run, {directory}")
-        return directory / MODEL_FILE
-    hierarchy = settings.hierarchy
-    path = zoo.find_model(settings.plant, (hierarchy.h, hierarchy.m, hierarchy.l))
-    if path:
-        screen.say(f"no run of train-hierarchy here: model {path.parent.name} of the zoo")
-        return path
-    screen.say(f"no model of plant {settings.plant}: true-state methods only")
-    return None
-
-
 def _source(found: dict[str, tuple[Entry, Path]]) -> str:
     paths = ", ".join(dict.fromkeys(str(path) for _, path in found.values()))
     return f"curves of {paths or 'nothing'}; --remeasure measures them again"
-
-
-def _how_to_train(method: str, subject: Subject) -> str:
-    """The command that trains the model of a method."""
-    train = "hjepa train-hierarchy"
-    if subject.settings.preset != "default":
-        train += f" --preset {subject.settings.preset}"
-    elif subject.settings.plant != "desktop":
-        train += f" --plant {subject.settings.plant}"
-    if method.startswith("ts-jepa-") and method != "ts-jepa-1":
-        h = int(method.removeprefix("ts-jepa-"))
-        return f"{train} --h {h} --m {h // 2 if h % 2 == 0 else 1} --l 1"
-    if method in ("hjepa", "ts-jepa-1", "hold", "zero"):
-        return train
-    return "no command of this version trains it"
 
 
 def _is_run(directory: Path) -> bool:

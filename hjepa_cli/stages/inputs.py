@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hjepa_cli import __version__
+from hjepa_cli.core.history import frames_seen
 from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import encode_frames
 from hjepa_cli.core.plant import plant, plant_of
@@ -51,10 +52,11 @@ class RenderedSplit:
     actions: Tensor
     labels: Tensor
 
-    def pairs(self, every: int, *, mirrored: bool = False) -> Tensor:
-        """(previous, current) frames of k = 0, ``every``, …: uint8 [N · K, 2, H, W, 3]."""
-        pairs = torch.stack([self.frames[:, :-1:every], self.frames[:, 1::every]], dim=2)
-        return (pairs.flip(-2) if mirrored else pairs).flatten(0, 1)
+    def seen(self, every: int, *, frames: int = 2, mirrored: bool = False) -> Tensor:
+        """What a device looks at in k = 0, ``every``, …: uint8 [N · K, κ, H, W, 3], κ frames."""
+        steps = np.arange(0, self.frames.shape[1] - 1, every)
+        seen = self.frames[:, torch.from_numpy(frames_seen(steps, frames))]
+        return (seen.flip(-2) if mirrored else seen).flatten(0, 1)
 
     def slice(self, start: int, stop: int) -> "RenderedSplit":
         """Trajectories ``start`` … ``stop`` − 1."""
@@ -66,31 +68,32 @@ class RenderedSplit:
         )
 
     def states_at(self, every: int) -> Tensor:
-        """States [N · K, S] that go with :meth:`pairs`."""
+        """States [N · K, S] that go with :meth:`seen`."""
         return self.states[:, ::every].flatten(0, 1)
 
     def labels_at(self, every: int) -> Tensor:
-        """Labels [N · K, *A] that go with :meth:`pairs`."""
+        """Labels [N · K, *A] that go with :meth:`seen`."""
         return self.labels[:, ::every].flatten(0, 1)
 
 
 def embed(
-    encoder: nn.Module,
+    encoder: Callable[[Tensor], Tensor],
     split: RenderedSplit,
     settings: Settings,
     *,
     every: int = 1,
+    frames: int = 2,
     mirrored: bool = False,
     advance: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
-    """Frozen embeddings [N, K, D] of frames k = 0, ``every``, … or of their mirror images."""
+    """Frozen embeddings [N, K, D] of k = 0, ``every``, …, from κ frames or their mirror images."""
     device = resolve_device(settings.device)
     precision = settings.encoder.precision
     parts = []
     for start in range(0, len(split.frames), CHUNK):
         part = split.slice(start, start + CHUNK)
-        pairs = part.pairs(every, mirrored=mirrored)
-        z = encode_frames(encoder, pairs, device=device, precision=precision)
+        seen = part.seen(every, frames=frames, mirrored=mirrored)
+        z = encode_frames(encoder, seen, device=device, precision=precision)
         parts.append(z.unflatten(0, (len(part.frames), -1)))
         advance(len(part.frames))
     return torch.cat(parts)

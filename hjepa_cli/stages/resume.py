@@ -61,6 +61,7 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
             dataset=dataset,
             out=directory,
             remeasure=remeasure,
+            further=_further(inputs),
         )
     if stage == "scale":
         from hjepa_cli.stages import scale
@@ -73,6 +74,7 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
             out=directory,
             remeasure=remeasure,
             verify=bool(inputs.get("verify")),
+            further=_further(inputs),
         )
     if stage == "reproduce":
         from hjepa_cli.stages import reproduce
@@ -108,6 +110,12 @@ def _path(inputs: dict[str, Any], name: str) -> Path | None:
     described = inputs.get(name)
     path = described.get("path") if isinstance(described, dict) else None
     return Path(path) if isinstance(path, str) else None
+
+
+def _further(inputs: dict[str, Any]) -> list[Path]:
+    """Where the models after the first one were."""
+    paths = [_path(inputs, name) for name in inputs if name.startswith("checkpoint ")]
+    return [path for path in paths if path is not None]
 
 
 def _text(path: Path | None) -> str | None:

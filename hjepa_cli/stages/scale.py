@@ -6,17 +6,21 @@ table, ``devices.csv`` and the paper's Fig. 4.
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.core.capacity import parse_snr
+from hjepa_cli.checks import RAW_FRAMES, late
+from hjepa_cli.core.capacity import late_slots, parse_snr, slot_capacity
 from hjepa_cli.core.cell import Cell, Need, Row, best_flat, gain
+from hjepa_cli.core.methods import FRAME_BITS
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import MissingInputError, NumericalError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.evaluate import Subject, curves_for, measure_points, open_subject
+from hjepa_cli.stages.evaluate import curves_for, measure_points
+from hjepa_cli.stages.subject import Subject, open_subject
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
 
@@ -39,6 +43,7 @@ def run(
     out: Path | None = None,
     remeasure: bool = False,
     verify: bool = False,
+    further: Sequence[Path] | None = None,
 ) -> dict[str, Any]:
     """Count devices; returns the document of ``--json``.
 
@@ -51,6 +56,7 @@ def run(
         out: run directory.
         remeasure: do not use cached curves.
         verify: drive a block of loops at 0.9 and 1.1 times each tolerance, now.
+        further: models of methods that the first one does not hold; ``None`` looks for them.
 
     Raises:
         UsageError: bad SNR grid or method.
@@ -59,9 +65,9 @@ def run(
         NumericalError: ``verify`` does not confirm a tolerance.
     """
     if settings.radio.law == "scheduled":
-        return run_scheduled(settings, screen, checkpoint, out, verify)
+        return run_scheduled(settings, screen, checkpoint, out, verify, further)
     grid_db = parse_snr(settings.radio.snr_db)
-    subject = open_subject(settings, screen, checkpoint, dataset)
+    subject = open_subject(settings, screen, checkpoint, dataset, further)
     skipped = subject.skipped(settings.methods)
     if len(skipped) == len(settings.methods):
         raise MissingInputError(
@@ -75,13 +81,18 @@ def run(
             show(record.result, screen)
             enforce(record.result.get("verify", []), level)
             return record.result
-        measured = curves_for(subject, screen, record, remeasure=remeasure)
-        cell = cell_of(settings)
-        needs = [Need.under(cell.law, *item) for item in measured["methods"].items()]
-        rows = [cell.row(need, snr_db) for snr_db in grid_db for need in needs]
+        cell, methods = cell_of(settings), subject.measurable(settings.methods)
+        wanted = {snr_db: [timed(name, cell, snr_db) for name in methods] for snr_db in grid_db}
+        names = list(dict.fromkeys(name for at in wanted.values() for name in at))
+        measured = curves_for(subject, screen, record, remeasure=remeasure, methods=names)
+        needs = {
+            name: Need.under(cell.law, name, entry) for name, entry in measured["methods"].items()
+        }
+        rows = [cell.row(needs[name], snr_db) for snr_db, at in wanted.items() for name in at]
         at_db = PAPER_SNR_DB if PAPER_SNR_DB in grid_db else max(grid_db)
         result: dict[str, Any] = {
             "checkpoint": measured["checkpoint"],
+            "checkpoints": measured["checkpoints"],
             "source": measured["source"],
             "plant": settings.plant,
             "seed": settings.seed,
@@ -101,7 +112,7 @@ def run(
         result["figures"] = draw(result, record.directory, screen)
         if verify:
             result["verify"] = [
-                check for need in needs for check in verify_need(need, subject, screen)
+                check for need in needs.values() for check in verify_need(need, subject, screen)
             ]
         result = record.finish(result)
         show(result, screen)
@@ -110,12 +121,19 @@ def run(
 
 
 def run_scheduled(
-    settings: Settings, screen: Screen, checkpoint: str | None, out: Path | None, verify: bool
+    settings: Settings,
+    screen: Screen,
+    checkpoint: str | None,
+    out: Path | None,
+    verify: bool,
+    further: Sequence[Path] | None,
 ) -> dict[str, Any]:
     """Hand over to the law that is simulated, not computed from curves."""
     from hjepa_cli.stages import scheduled
 
-    return scheduled.run(settings, screen, checkpoint=checkpoint, out=out, verify=verify)
+    return scheduled.run(
+        settings, screen, checkpoint=checkpoint, out=out, verify=verify, further=further
+    )
 
 
 def cell_of(settings: Settings) -> Cell:
@@ -123,6 +141,19 @@ def cell_of(settings: Settings) -> Cell:
     radio, chosen = settings.radio, plant(settings.plant)
     limit_bits_per_s = chosen.data_rate_limit_bits_per_s
     return Cell(radio.law, radio.noise, radio.bandwidth_hz, chosen.step_s, limit_bits_per_s)
+
+
+def timed(method: str, cell: Cell, snr_db: float) -> str:
+    """A method as it is under the law ``duty`` at an SNR: late, where its packet takes slots.
+
+    Raw frames alone are driven so late: of the others, whose packets take slots in narrow bands
+    only, the law subtracts the delay from the tolerated gap.
+    """
+    if cell.law != "duty" or method not in RAW_FRAMES:
+        return method
+    bits = int(method.rpartition("-")[2]) * FRAME_BITS
+    c = slot_capacity(bits, cell.bandwidth_hz, cell.slot_s, snr_db)
+    return late(method, math.ceil(late_slots(c)))
 
 
 def gains(rows: Sequence[Row], snr_db: float) -> list[Row]:
@@ -141,7 +172,7 @@ def verify_need(need: Need, subject: Subject, screen: Screen) -> list[Row]:
     """
     settings = subject.settings
     duty, level = settings.radio.law == "duty", settings.protocol.acceptable_score
-    if not need.tolerance or need.tolerance == 1:
+    if not need.tolerance or need.tolerance == 1 or not need.payload_bits:
         return []
     points = []
     for share in VERIFY_AT:
@@ -152,13 +183,13 @@ def verify_need(need: Need, subject: Subject, screen: Screen) -> list[Row]:
     measured = measure_points(
         subject,
         screen,
-        method=need.method,
+        method=late(need.method, need.delay_steps),
         gaps=values if duty else (),
         probabilities=() if duty else values,
     )
     return [
         {
-            "method": need.method,
+            "method": late(need.method, need.delay_steps),
             "share_of_tolerance": share,
             **point,
             "expected": "above" if inside else "below",
@@ -215,6 +246,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
     for row in result["rows"]:
         by_method.setdefault(row["method"], []).append(row)
     ranked = sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
+    loops = {_loop(row): row for _, rows in ranked for row in reversed(rows)}
     duty, level = result["law"] == "duty", result["acceptable_score"]
     digits, bound = (1, "≥") if duty else (4, "≤")
 
@@ -225,7 +257,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
         ["method", "gap D* [steps]" if duty else "delivery p*", "bits", "bit/s", "÷limit"],
         [
             [
-                method,
+                loop,
                 span(
                     row["tolerance"],
                     row["tolerance_ci95"],
@@ -236,7 +268,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
                 None if row["bits_per_s"] is None else f"{row['bits_per_s']:,.0f}",
                 None if row["ratio_to_limit"] is None else f"{row['ratio_to_limit']:,.0f}",
             ]
-            for method, (row, *_) in ranked
+            for loop, row in loops.items()
         ],
     )
     screen.table(
@@ -281,6 +313,12 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
             screen.say(f"{method} at {row['snr_db']:g} dB: {row['reason']}")
     screen.say(result["source"])
     screen.say(f"written: {', '.join(str(path) for path in (result['csv'], *result['figures']))}")
+
+
+def _loop(row: Row) -> str:
+    """A method, and how late its packets are."""
+    delay = row.get("delay_steps", 0)
+    return f"{row['method']}, {delay} steps late" if delay else row["method"]
 
 
 def _described(result: Mapping[str, Any]) -> str:

@@ -4,17 +4,19 @@ One resource block is simulated with its devices, radio and scheduler in one loo
 that keeps the score acceptable, times the transmissions that fit into a slot, are the devices.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli.checks import LINKLESS, RAW_FRAMES
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.cell import Row, best_flat, ratio_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.scheduled import BLOCK_DEVICES
-from hjepa_cli.errors import MissingInputError
+from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.evaluate import open_subject
+from hjepa_cli.stages.subject import open_subject
 from hjepa_cli.stages.scale import PAPER_GAIN_PERCENT, PAPER_SNR_DB, draw, enforce, write_csv
 from hjepa_cli.stages.scheduled_cell import ScheduledCell
 from hjepa_cli.storage.runs import Run
@@ -33,11 +35,12 @@ def run(
     checkpoint: str | None = None,
     out: Path | None = None,
     verify: bool = False,
+    further: Sequence[Path] | None = None,
 ) -> dict[str, Any]:
     """Count devices under each scheduler; returns the document of ``--json``.
 
     Args:
-        settings, screen, checkpoint, out: as for :func:`hjepa_cli.stages.scale.run`.
+        settings, screen, checkpoint, out, further: as for :func:`hjepa_cli.stages.scale.run`.
         verify: simulate each load again, a little lighter and a little heavier.
 
     Raises:
@@ -46,12 +49,17 @@ def run(
         NumericalError: ``verify`` does not confirm a load.
     """
     grid_db = parse_snr(settings.radio.snr_db)
-    subject = open_subject(settings, screen, checkpoint, None)
+    if raw := [name for name in settings.methods if name in RAW_FRAMES]:
+        raise UsageError(
+            f"law scheduled fits packets into slots; {', '.join(raw)} needs several slots for one",
+            hint="choose --law duty for it, or other --methods",
+        )
+    subject = open_subject(settings, screen, checkpoint, None, further)
     skipped = subject.skipped(settings.methods)
     subject.say_skipped(settings.methods, screen)
-    methods = [name for name in subject.measurable(settings.methods) if name != "optimal"]
+    methods = [name for name in subject.measurable(settings.methods) if name not in LINKLESS]
     if not methods:
-        hint = next(iter(skipped.values()), "choose another method than optimal, which has no link")
+        hint = next(iter(skipped.values()), "choose a method that has a link")
         raise MissingInputError(f"nothing to schedule for {', '.join(settings.methods)}", hint=hint)
     level = settings.protocol.acceptable_score
     inputs = subject.inputs(verify=verify)

@@ -30,7 +30,7 @@ from hjepa_cli.core.scheduled import (
 )
 from hjepa_cli.core.uplink import Access, report_bits
 from hjepa_cli.screen import Screen
-from hjepa_cli.stages.evaluate import Subject
+from hjepa_cli.stages.subject import Subject
 
 CALIBRATION_SEED = 1_000_003  # added to the seed: growth is measured on other devices
 VERIFY_AT = (0.9, 1.1)  # times the load
@@ -219,7 +219,7 @@ class ScheduledCell:
 
     def _method(self, name: str) -> Method:
         if name not in self._methods:
-            self._methods[name] = build_method(name, self._settings, self._subject.model)
+            self._methods[name] = build_method(name, self._settings, self._subject.of(name).model)
         return self._methods[name]
 
     def _growth_of(self, name: str, seed: int) -> Growth:

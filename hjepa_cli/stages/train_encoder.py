@@ -1,32 +1,31 @@
-"""``hjepa train-encoder``: learn Ψ and its companion P^H from rendered frames.
+"""``hjepa train-encoder``: learn Ψ and its companion P^H from rendered frames, or a baseline.
 
-Dataset → encoder checkpoint. The story: render the trajectories once, train the JEPA on whole
-sub-sampled trajectories, look at the representation's health every epoch, and let the stage gates
-decide whether the result is worth handing on.
+Dataset → checkpoint. The story: render the trajectories once, train on whole sub-sampled
+trajectories, look at the representation's health every epoch, and let the stage gates decide
+whether the result is worth handing on. The baselines are in :mod:`hjepa_cli.stages.baselines`.
 """
 
 import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
+from torch import nn
 
 from hjepa_cli.core import health
-from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.jepa import Jepa
 from hjepa_cli.core.model import build_modules, tensors_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.predictors import Predictor
 from hjepa_cli.core.ranks import ALONE, Ranks, joined
-from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.shared_norm import share_statistics
-from hjepa_cli.core.training import Optimiser, autocast, fit_actor, resolve_device
-from hjepa_cli.errors import NumericalError
+from hjepa_cli.core.training import fit_actor, resolve_device
+from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, dotted
+from hjepa_cli.stages import baselines
+from hjepa_cli.stages.frame_training import Training, standardisation_sample
 from hjepa_cli.stages.inputs import (
     RenderedSplit,
     check_stride,
@@ -36,11 +35,9 @@ from hjepa_cli.stages.inputs import (
     training_run,
     versions,
 )
-from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
-from hjepa_cli.storage.runs import Run, describe_input
+from hjepa_cli.storage.runs import describe_input
 
-STREAM = 2  # this stage's branch of the seed tree
 REJECTED_FILE = "rejected.safetensors"  # what did not pass the gates: nothing trained is lost
 PROBE_EPOCHS = 20  # of the quick probe actor that watches training …
 WATCHED = 80  # … on so many training trajectories: a look must not cost more than it tells
@@ -49,17 +46,19 @@ WATCHED = 80  # … on so many training trajectories: a look must not cost more 
 def run(
     settings: Settings, screen: Screen, *, dataset: Path | None = None, out: Path | None = None
 ) -> dict[str, Any]:
-    """Train, gate and save an encoder; returns the document of ``--json``.
+    """Train, gate and save an encoder or a baseline; returns the document of ``--json``.
 
     Under ``torchrun`` several processes share the steps; the first does all the rest.
 
     Raises:
-        UsageError: no such device, or too many processes.
+        UsageError: no such device, too many processes, or several of them for a baseline.
         MissingInputError: no dataset.
         NumericalError: training diverged, or a gate failed (see ``settings.encoder.gate``).
     """
     device = resolve_device(settings.device)  # refused before anything is read
     with joined(device, settings.encoder.batch_trajectories) as ranks:
+        if ranks.size > 1 and settings.encoder.method != "jepa":
+            raise UsageError(f"torchrun trains the jepa alone, not {settings.encoder.method}")
         return _run(settings, screen, dataset, out, ranks)
 
 
@@ -81,14 +80,13 @@ def _run(
         architecture = describe_architecture(settings)
         kind = plant(settings.plant)
         modules = build_modules(architecture, kind.action_shape, kind.force_signs)
-        encoder, companion = modules["encoder"], modules["high"]
-        assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
-        train_jepa(encoder, companion, train, test, settings, record, progress, screen, ranks)
+        training = Training(settings, train, test, record, progress, screen, ranks)
+        if settings.encoder.method == "jepa":
+            report = train_jepa(modules, training)
+        else:
+            report = baselines.train(modules, training)
         if not ranks.leads:
             return {}
-
-        screen.say("measuring health on all frames and fitting the probe actor")
-        report = examine(encoder, companion, train, test, settings, every=1, epochs=None)
         gates = judge(report, settings)
         accepted = all(gate["passed"] for gate in gates.values()) or not settings.encoder.gate
         path = record.path(MODEL_FILE if accepted else REJECTED_FILE)
@@ -106,7 +104,7 @@ def _run(
         save_checkpoint(path, tensors_of(modules), metadata)
         show_gates(screen, gates)
         if not accepted:
-            refuse(gates, path)
+            refuse(gates, path, settings)
         result = {
             "checkpoint": str(path),
             "seconds": round(progress.seconds, 2),
@@ -115,13 +113,16 @@ def _run(
         }
         result = record.finish(result)
         progress.remove()
-        screen.say(f"encoder {path} in {result['seconds']:.0f} s; next: hjepa train-hierarchy")
+        following = "train-hierarchy" if settings.encoder.method == "jepa" else "eval"
+        screen.say(f"{path} in {result['seconds']:.0f} s; next: hjepa {following}")
         return result
 
 
 def describe_architecture(settings: Settings) -> dict[str, Any]:
     """What :func:`build_modules` needs, as it goes into the checkpoint."""
     encoder = settings.encoder
+    if encoder.method != "jepa":
+        return baselines.describe_architecture(settings)
     return {
         "kind": "encoder",
         "embedding": encoder.embedding,
@@ -137,21 +138,13 @@ def describe_architecture(settings: Settings) -> dict[str, Any]:
     }
 
 
-def train_jepa(
-    encoder: Encoder,
-    companion: Predictor,
-    train: RenderedSplit,
-    test: RenderedSplit,
-    settings: Settings,
-    record: Run,
-    progress: Progress,
-    screen: Screen,
-    ranks: Ranks = ALONE,
-) -> None:
-    """The training loop; modules are trained in place and left in evaluation mode."""
-    options, kind = settings.encoder, plant(settings.plant)
-    device = resolve_device(settings.device)
-    encoder.fit_standardisation(standardisation_sample(train.frames))
+def train_jepa(modules: nn.ModuleDict, training: Training) -> dict[str, Any]:
+    """Train Ψ and P^H in place; returns their health, of the process that leads."""
+    settings, ranks, options = training.settings, training.ranks, training.settings.encoder
+    kind = plant(settings.plant)
+    encoder, companion = modules["encoder"], modules["high"]
+    assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
+    encoder.fit_standardisation(standardisation_sample(training.train.frames))
     if ranks.size > 1:
         share_statistics(encoder)
     jepa = Jepa(
@@ -160,60 +153,24 @@ def train_jepa(
         ema_decay=options.ema_decay,
         inverse_dynamics=options.inverse_dynamics,
         rollout_strides=max(options.rollout_steps // options.h, 1),
-        device=device,
+        device=resolve_device(settings.device),
         forces=math.prod(kind.action_shape),
         mirror=kind.force_signs if options.mirror == "exact" else None,
     )
-    optimiser = Optimiser(
-        jepa.parameters(),
-        name=options.optimizer,
-        schedule=options.schedule,
-        steps=options.steps,
-        learning_rate=options.learning_rate,
-        weight_decay=options.weight_decay,
-        gradient_clip=options.gradient_clip,
-        ranks=ranks,
-    )
-    windows = FrameWindows(
-        train.frames,
-        train.actions,
-        window_frames=options.batch_frames,
-        stride=options.h,
-        mirror=options.mirror == "augment",
-        shift_px=options.shift_px,
-        mirrored_actions=kind.mirror,
-    )
-    stream = generator(settings.seed, STREAM)
-    share = ranks.share(options.batch_trajectories)
-    part = (share.stop - share.start) / options.batch_trajectories  # 1 on a single process
-    frames_per_epoch = train.actions.numel()
-    epoch_steps = max(frames_per_epoch // (options.batch_trajectories * windows.window_frames), 1)
-    parts = jepa.parts() | {"optimiser": optimiser}
-    done = progress.reached("jepa")
-    with screen.progress("train-encoder", options.steps, "steps", done=done) as bar:
-        for step in progress.steps("jepa", options.steps, parts, stream):
-            encoder.train()
-            batch = windows.draw(options.batch_trajectories, stream, share)
-            with autocast(device, options.precision):
-                terms = {name: part * term for name, term in jepa.losses(batch).items()}
-            loss = optimiser.step(jepa.total(terms), step, lambda batch=batch: batch.drawn)
-            jepa.update_target()
-            bar.advance(1, loss=loss)
-            if (step + 1) % epoch_steps == 0:
-                ranks.add_up(list(terms.values()))
-                if not ranks.leads:
-                    continue
-                report = examine(
-                    encoder,
-                    companion,
-                    train.slice(0, WATCHED),
-                    test,
-                    settings,
-                    every=math.gcd(4, options.h),
-                )
-                losses = {f"loss_{name}": term.item() for name, term in terms.items()}
-                record.metric({"step": step + 1, **losses, **dotted(report, "_")})
+
+    def look(terms: dict[str, float]) -> dict[str, Any]:
+        few, every = training.train.slice(0, WATCHED), math.gcd(4, options.h)
+        report = examine(encoder, companion, few, training.test, settings, every=every)
+        return {f"loss_{name}": value for name, value in terms.items()} | dotted(report, "_")
+
+    training.fit("jepa", jepa, look)
     encoder.eval()
+    if not ranks.leads:
+        return {}
+    training.screen.say("measuring health on all frames and fitting the probe actor")
+    return examine(
+        encoder, companion, training.train, training.test, settings, every=1, epochs=None
+    )
 
 
 def examine(
@@ -279,6 +236,8 @@ def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any
         "effective_rank": options.gate_rank,
         "action_sensitivity": options.gate_sensitivity,
     }
+    if options.method != "jepa":
+        lower_bounds = {}  # a baseline is there to act, and nothing else
     values = dotted(report, "_")
     gates = {
         name: {"value": values[name], "threshold": bound, "passed": values[name] >= bound}
@@ -303,23 +262,17 @@ def show_gates(screen: Screen, gates: dict[str, dict[str, Any]]) -> None:
     screen.table("health, held out", ["measure", "value", "gate", ""], rows)
 
 
-def refuse(gates: dict[str, dict[str, Any]], path: Path) -> None:
+def refuse(gates: dict[str, dict[str, Any]], path: Path, settings: Settings) -> None:
     """Stop the pipeline at a representation that cannot carry control."""
     failed = [
         f"{name} {gate['value']:.3f} (gate {gate['threshold']:g})"
         for name, gate in gates.items()
         if not gate["passed"]
     ]
+    is_jepa = settings.encoder.method == "jepa"
+    further = "train-hierarchy --encoder" if is_jepa else "eval --checkpoint"
     raise NumericalError(
         f"the encoder failed its gate: {', '.join(failed)}",
         hint="collect more trajectories or train for more steps; --no-gate skips the gate, and "
-        f"hjepa train-hierarchy --encoder {path} goes on with this one",
+        f"hjepa {further} {path} goes on with this one",
     )
-
-
-def standardisation_sample(frames: Tensor, pairs: int = 512) -> Tensor:
-    """Evenly spaced (previous, current) pairs [≤ ``pairs``, 2, H, W, 3] of the training split."""
-    flat = frames.flatten(0, 1)
-    current = np.linspace(1, len(flat) - 1, min(pairs, len(flat) - 1)).astype(int)
-    current = current[current % frames.shape[1] != 0]  # the first frame has no predecessor
-    return torch.stack([flat[current - 1], flat[current]], dim=1)

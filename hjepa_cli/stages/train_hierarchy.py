@@ -1,5 +1,7 @@
 """``hjepa train-hierarchy --h 4 --m 2 --l 1``: P^H, P^M, P^L, ts-jepa-1 and the semantic actor.
 
+``--h 4`` alone: one level of that stride, ts-jepa-1 and the actor.
+
 Dataset + encoder checkpoint → one checkpoint with everything inference needs. The encoder is
 frozen: every frame is encoded once, and all that follows are small networks on embeddings.
 """
@@ -16,12 +18,11 @@ from torch import Tensor, nn
 
 from hjepa_cli.core import health, levels
 from hjepa_cli.core.bench import control_errors
-from hjepa_cli.core.codecs import build_codec
 from hjepa_cli.core.hierarchy import Strides
 from hjepa_cli.core.levels import EmbeddedTrajectories
-from hjepa_cli.core.methods import embedding_method
+from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import window_means
-from hjepa_cli.core.model import Model, build_modules, load_modules, tensors_of
+from hjepa_cli.core.model import LEVELS, Model, build_modules, load_modules, tensors_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import (
@@ -91,7 +92,8 @@ def run(
         modules = build_modules(architecture, kind.action_shape, kind.force_signs)
         modules["encoder"].load_state_dict(trained["encoder"].state_dict())
         modules["encoder"].requires_grad_(False).eval()
-        if source.metadata["architecture"]["h"] == strides.h:
+        started = "high" in trained and "high" in modules
+        if started and source.metadata["architecture"]["h"] == strides.h:
             modules["high"].load_state_dict(trained["high"].state_dict())
         modules.to(resolve_device(settings.device))
 
@@ -132,6 +134,7 @@ def run(
             "strides": {"h": strides.h, "m": strides.m, "l": strides.l},
             "seconds": round(progress.seconds, 2),
             "health": metadata["health"],
+            "method": model.methods[0],
             "nmae_windows": nmae_windows(model, data, settings),
             "n_rollouts": len(data.split("clean")),
         }
@@ -146,8 +149,8 @@ def show(result: dict[str, Any], screen: Screen) -> None:
     """What the trained model does without packets, before ``eval`` closes the loop."""
     windows = result["nmae_windows"]
     screen.table(
-        f"hjepa alone after one packet: NMAE by steps ({result['n_rollouts']} clean rollouts); "
-        "actor NRMSE and P^H's action sensitivity held out",
+        f"{result.get('method', 'hjepa')} alone after one packet: NMAE by steps "
+        f"({result['n_rollouts']} clean rollouts); actor NRMSE and action sensitivity held out",
         [*windows, "actor NRMSE", "sensitivity"],
         [
             [
@@ -173,7 +176,8 @@ def open_encoder(name: str | None, settings: Settings, screen: Screen) -> Checkp
 
         def fits(run: Path) -> bool:
             config = read_config(run)
-            return (config["plant"], described(config["encoder"])) == wanted
+            is_jepa = config["encoder"].get("method", "jepa") == "jepa"
+            return is_jepa and (config["plant"], described(config["encoder"])) == wanted
 
         found = newest_run("train-encoder", fits) or find_model(settings.plant)
         if found is None:
@@ -192,6 +196,12 @@ def open_encoder(name: str | None, settings: Settings, screen: Screen) -> Checkp
             f"the dataset is of plant {settings.plant}",
             hint=f"hjepa train-encoder --plant {settings.plant}",
         )
+    architecture = checkpoint.metadata.get("architecture")
+    if isinstance(architecture, dict) and architecture.get("kind") in ("supervised", "autoencoder"):
+        raise DataError(
+            f"{checkpoint.path} is a baseline on raw frames, no encoder for predictors",
+            hint="hjepa train-encoder, or pass another --encoder",
+        )
     return checkpoint
 
 
@@ -203,8 +213,9 @@ def described(encoder: dict[str, Any]) -> dict[str, Any]:
 def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, Any]:
     """The encoder's architecture with this stage's strides and actor."""
     hierarchy = settings.hierarchy
+    levels = {hierarchy.h, hierarchy.m, hierarchy.l}
     return source.metadata["architecture"] | {
-        "kind": "hierarchy",
+        "kind": "hierarchy" if len(levels) > 1 else "flat",
         "h": hierarchy.h,
         "m": hierarchy.m,
         "l": hierarchy.l,
@@ -234,14 +245,15 @@ def embed_all(
 def examine(
     modules: nn.ModuleDict, test: RenderedSplit, h: int, settings: Settings
 ) -> dict[str, float]:
-    """Held-out health of what this stage trained: the actor's error and P^H's sensitivity."""
+    """Held-out health of what this stage trained: the actor and the coarsest level."""
     z = embed(modules["encoder"], test, settings)
-    actor, high = copy.deepcopy(modules["actor"]).cpu(), copy.deepcopy(modules["high"]).cpu()
+    coarsest = modules["high" if "high" in modules else "flat"]
+    actor, coarsest = copy.deepcopy(modules["actor"]).cpu(), copy.deepcopy(coarsest).cpu()
     start, end = z[:, :-h].flatten(0, 1), z[:, h:].flatten(0, 1)
     return {
         "actor_nrmse": health.nrmse(actor.act(z), test.labels),
         "action_sensitivity": health.action_sensitivity(
-            high, start, end, h, plant(settings.plant).action_shape
+            coarsest, start, end, h, plant(settings.plant).action_shape
         ),
     }
 
@@ -255,13 +267,14 @@ def train_levels(
     progress: Progress,
     screen: Screen,
 ) -> None:
-    """Train P^H, P^M, P^L and the flat baseline, in that order: each level builds on the last."""
+    """Train the levels that the model has, in the order in which each builds on the last."""
     options = settings.hierarchy
     h, m, l = strides.h, strides.m, strides.l
     coarse_data = join(seen)
     fine_data = join([data.first(options.fine_trajectories) for data in seen])
     device = resolve_device(settings.device)
-    high, medium, low, flat = (modules[name] for name in ("high", "medium", "low", "flat"))
+    names = LEVELS["hierarchy"]
+    high, medium, low, flat = (modules[name] if name in modules else None for name in names)
     count = options.batch_trajectories
     common = {"horizon_steps": options.rollout_steps, "trajectories": count}
 
@@ -273,7 +286,7 @@ def train_levels(
         loss: Callable[[Generator], Tensor],
     ) -> None:
         # Every level has its own stream: what one does changes no other.
-        stream = generator(settings.seed, STREAM, list(modules).index(name))
+        stream = generator(settings.seed, STREAM, 1 + names.index(name))
         optimiser = Optimiser(
             modules[name].parameters(),
             name=options.optimizer,
@@ -314,7 +327,8 @@ def train_levels(
             flat, coarse_data, 1, starts=options.flat_starts, generator=stream, **common
         )
 
-    fit("high", "coarse", options.coarse_steps, coarse_data, high_loss)
+    if high is not None:
+        fit("high", "coarse", options.coarse_steps, coarse_data, high_loss)
     if h > m:
         fit("medium", "medium", options.medium_steps, fine_data, medium_loss)
     if m > l:
@@ -339,11 +353,11 @@ def join(seen: list[EmbeddedTrajectories]) -> EmbeddedTrajectories:
 
 
 def nmae_windows(model: Model, data: Dataset, settings: Settings) -> dict[str, float]:
-    """Prediction error of ``hjepa`` after a single packet, on the dataset's clean rollouts."""
+    """Prediction error of the model's first method after one packet, on the clean rollouts."""
     clean = data.split("clean")
     limit_n = plant(settings.plant).force_limit_n
     errors = control_errors(
-        embedding_method("hjepa", model, build_codec(settings.protocol.payload, model, settings)),
+        build_method(model.methods[0], settings, model),
         clean.states.astype(float),
         clean.teacher_n.astype(float),
         limit_n,

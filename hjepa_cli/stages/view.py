@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hjepa_cli.checks import ANCHORS, RAW_FRAMES
 from hjepa_cli.core import health
 from hjepa_cli.core.capacity import equal_devices
 from hjepa_cli.core.channel import rayleigh_power_gains
@@ -28,7 +29,7 @@ from hjepa_cli.core.trajectories import generate
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.evaluate import open_subject
+from hjepa_cli.stages.subject import open_subject
 
 FADING_KEY = 0xFAD1
 PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encoded in seconds
@@ -192,11 +193,12 @@ def belief_errors(shot: Film, kind: System) -> dict[str, float]:
 
 def check_methods(methods: Sequence[str], model: Model) -> None:
     """Only methods on embeddings believe in something that can be shown."""
+    viewable = [name for name in model.methods if name not in (*RAW_FRAMES, *ANCHORS)]
     for name in methods:
-        if name not in model.methods:
+        if name not in viewable:
             raise UsageError(
                 f"method '{name}' cannot be viewed with this model; "
-                f"choose from {', '.join(model.methods)}"
+                f"choose from {', '.join(viewable)}"
             )
 
 

@@ -130,6 +130,11 @@ def find(
     return found
 
 
+def further_file(digest: Digest) -> str:
+    """The file in a run for curves of another model than the first one."""
+    return f"{Path(CURVES_FILE).stem}-{(digest.checkpoint or '')[:12]}.json"
+
+
 def write(path: Path, digest: Digest, entries: Mapping[str, Entry]) -> None:
     """Add entries to ``path``, keeping those of the same digest, replacing all others.
 
@@ -146,7 +151,8 @@ def write(path: Path, digest: Digest, entries: Mapping[str, Entry]) -> None:
 
 def _newest_first(*stages: Path) -> list[Path]:
     """The curve files of these stages' runs."""
-    paths = (stage / name / CURVES_FILE for stage in stages for name in files.list_names(stage))
+    runs = (stage / name for stage in stages for name in files.list_names(stage))
+    paths = (path for run in runs for path in run.glob(f"{Path(CURVES_FILE).stem}*.json"))
     return sorted(
         (path for path in paths if path.is_file()),
         key=lambda path: path.stat().st_mtime_ns,
@@ -222,7 +228,7 @@ _CHECKS: dict[str, Check] = {
     "tolerance_p": _is_tolerance,
     "tolerance_p_ci95": _or_none(_is_interval),
     "tolerance_p_censored": _or_none(_is_flag),
-    "bits_per_transmission": lambda value: value is None or _is_count(value),
+    "bits_per_transmission": lambda value: value is None or value == 0 or _is_count(value),
     "n_devices": _is_count,
     "n_curve_devices": _is_count,
     "n_rollouts": _is_count,

@@ -23,7 +23,7 @@ from typing import IO, Any, Self
 from hjepa_cli import __version__, torchrun
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
 from hjepa_cli.interrupts import exit_code
-from hjepa_cli.settings import dotted
+from hjepa_cli.settings import dotted, load_settings
 from hjepa_cli.storage import files, tracking
 
 ROOT = Path("runs")
@@ -216,15 +216,17 @@ def newest_run(
     stage: str, predicate: Callable[[Path], bool] = lambda directory: True, root: Path = ROOT
 ) -> Path | None:
     """Return the most recently finished ``runs/<stage>/*`` that satisfies ``predicate``, if any."""
+    return next(filter(predicate, finished_runs(stage, root=root)), None)
+
+
+def finished_runs(*stages: str, root: Path = ROOT) -> list[Path]:
+    """Return the finished ``runs/<stage>/*`` of some stages, newest first."""
     finished = []
-    for name in files.list_names(root / stage):
-        result = root / stage / name / RESULT
-        if result.is_file():
-            finished.append((result.stat().st_mtime_ns, name))
-    for _, name in sorted(finished, reverse=True):
-        if predicate(root / stage / name):
-            return root / stage / name
-    return None
+    for place in (root / stage for stage in stages):
+        for directory in (place / name for name in files.list_names(place)):
+            if (directory / RESULT).is_file():
+                finished.append(((directory / RESULT).stat().st_mtime_ns, directory))
+    return [directory for _, directory in sorted(finished, reverse=True)]
 
 
 def read_result(directory: Path) -> dict[str, Any]:
@@ -326,6 +328,9 @@ def _refuse_foreign(directory: Path, stage: str) -> None:
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Name the settings that differ, as ``section.key = old, not new``."""
     before, after = dotted(old), dotted(files.jsonable(new))
+    if later := after.keys() - before.keys():  # settings that there were none of had their default
+        defaults = dotted(load_settings().as_dict())
+        before |= {key: defaults[key] for key in later if key in defaults}
     return [
         f"{key} = {before.get(key)!r}, not {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys())

@@ -49,15 +49,18 @@ def list_models() -> list[str]:
 
 
 def find_model(plant_name: str, strides: Sequence[int] = ()) -> Path | None:
-    """Return the checkpoint file of the zoo's model of a plant, if there is one.
+    """Return the checkpoint file of the zoo's hierarchy of a plant, if there is one.
 
     The first one with ``strides`` (h, m, l); where no model has them, the first one.
     """
     first = None
     for path in map(resolve_model, list_models()):
         metadata = load_checkpoint(path).metadata
-        if metadata.get("plant") == plant_name:
-            architecture = metadata.get("architecture", {})
+        architecture = metadata.get("architecture", {})
+        if (
+            metadata.get("plant") == plant_name
+            and architecture.get("kind", "hierarchy") == "hierarchy"
+        ):
             if [architecture.get(name) for name in ("h", "m", "l")] == list(strides):
                 return path
             first = first or path

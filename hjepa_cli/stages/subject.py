@@ -1,0 +1,224 @@
+"""What ``eval`` and ``scale`` measure: a trained model for each method, found wherever it is.
+
+The model that the user names, or the newest run's, or the zoo's, comes first. A method that it does
+not hold is looked for in the other runs of the plant, newest first, and in the zoo.
+"""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from hjepa_cli.checks import ANCHORS, RAW_FRAMES, TRUE_STATE, split_late
+from hjepa_cli.core.model import Model, offered
+from hjepa_cli.core.plant import plant, plant_of
+from hjepa_cli.errors import DataError, HjepaError
+from hjepa_cli.screen import Screen
+from hjepa_cli.settings import Settings
+from hjepa_cli.storage import runs, zoo
+from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
+from hjepa_cli.storage.curves import Digest
+from hjepa_cli.storage.datasets import Dataset, load_dataset
+from hjepa_cli.storage.zoo import CURVES_FILE
+
+TRAINING = ("train-encoder", "train-hierarchy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What is evaluated: a model, if there is one, and the rollouts its NMAE is taken on.
+
+    Attributes:
+        settings: plant, seed, protocol.
+        model: ``None`` when only true-state methods can be measured.
+        path: the model's file.
+        dataset: whose clean rollouts to use; ``None`` makes them again from the settings.
+        further: of other models, for methods that this one does not hold.
+    """
+
+    settings: Settings
+    model: Model | None
+    path: Path | None
+    dataset: Dataset | None
+    further: tuple["Subject", ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The models' paths, for people."""
+        return ", ".join(str(one.path) for one in (self, *self.further) if one.path) or "no model"
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """All methods that can be measured."""
+        held = [name for one in (self, *self.further) if one.model for name in one.model.methods]
+        return tuple(dict.fromkeys([*held, *TRUE_STATE]))
+
+    def measurable(self, methods: Sequence[str]) -> list[str]:
+        """Those of ``methods`` that can be measured, in their order."""
+        return [name for name in methods if name in self.methods]
+
+    def of(self, method: str) -> "Subject":
+        """Whose model holds a method, on time or late; this one for methods on the true state."""
+        name, _ = split_late(method)
+        holders = (one for one in (self, *self.further) if one.model and name in one.model.methods)
+        return next(holders, self)
+
+    def shared_out(self, methods: Iterable[str]) -> list[tuple["Subject", list[str]]]:
+        """Methods by the subject that holds them."""
+        shares: dict[Path | None, tuple[Subject, list[str]]] = {}
+        for name in methods:
+            holder = self.of(name)
+            shares.setdefault(holder.path, (holder, []))[1].append(name)
+        return list(shares.values())
+
+    @property
+    def digest(self) -> Digest:
+        """What curves must have been measured with to be this subject's."""
+        return Digest.of(
+            self.model.digest if self.model else None,
+            self.settings,
+            self.dataset.settings if self.dataset else None,
+        )
+
+    def inputs(self, **flags: bool) -> dict[str, Any]:
+        """What a run of this subject was given, for :meth:`Run.create`."""
+        given: dict[str, Any] = dict(flags)
+        models = [
+            "checkpoint",
+            *(f"checkpoint {number + 2}" for number in range(len(self.further))),
+        ]
+        for key, one in zip(models, (self, *self.further), strict=True):
+            if one.model and one.path:
+                given[key] = runs.describe_input(one.path, one.model.digest)
+        if self.dataset:
+            given["dataset"] = runs.describe_input(self.dataset.path, self.dataset.digest)
+        return given
+
+    @property
+    def beside(self) -> list[Path]:
+        """Where the model's own curves are; the zoo's are never written, a run's are."""
+        return [self.path.with_name(CURVES_FILE)] if self.path else []
+
+    def skipped(self, methods: Sequence[str]) -> dict[str, str]:
+        """The methods without a model, with what would train it."""
+        missing = [name for name in methods if name not in self.methods]
+        return {name: how_to_train(name, self.settings) for name in missing}
+
+    def say_skipped(self, methods: Sequence[str], screen: Screen) -> None:
+        """Tell the user about them."""
+        for name, how in self.skipped(methods).items():
+            screen.say(f"{name} skipped, no model of it here: {how}")
+
+
+def open_subject(
+    settings: Settings,
+    screen: Screen,
+    checkpoint: str | None,
+    dataset: Path | None,
+    further: Sequence[Path] | None = None,
+) -> Subject:
+    """Load what is to be evaluated, and say which models they are where the user did not.
+
+    Args:
+        settings: plant, seed, protocol and the methods to find models for.
+        screen: where to say so.
+        checkpoint: zoo name, run directory or file of the first model.
+        dataset: whose clean rollouts to use.
+        further: models of the other methods; ``None`` looks for them.
+
+    Raises:
+        MissingInputError, DataError: no such file, damaged, or of another plant.
+    """
+    plant_of(settings)
+    path = zoo.resolve_model(checkpoint) if checkpoint else _default_model(settings, screen)
+    model = Model.load(path, settings.device) if path else None
+    if model and model.plant_name != settings.plant:
+        raise DataError(
+            f"model {path} drives plant {model.plant_name}, not {settings.plant}",
+            hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
+        )
+    data = load_dataset(dataset, settings.plant) if dataset else None
+    held = (*(model.methods if model else ()), *TRUE_STATE)
+    lacking = [name for name in settings.methods if name not in held]
+    if further is None:
+        further = _find(lacking, settings, screen) if lacking else []
+    others = tuple(
+        Subject(settings, Model.load(other, settings.device), other, data) for other in further
+    )
+    return Subject(settings, model, path, data, others)
+
+
+def how_to_train(method: str, settings: Settings) -> str:
+    """The command that trains the model of a method."""
+    if method not in RAW_FRAMES:
+        train = "hjepa train-hierarchy"
+    else:
+        kind, frames = method.split("-")
+        train = f"hjepa train-encoder --method {kind}"
+        train += f" --frames {frames}" if frames != "2" else ""
+    if settings.preset != "default":
+        train += f" --preset {settings.preset}"
+    elif settings.plant != "desktop":
+        train += f" --plant {settings.plant}"
+    if method.startswith("ts-jepa-") and method != "ts-jepa-1":
+        return f"{train} --h {method.removeprefix('ts-jepa-')}"
+    if method in ANCHORS and len(plant(settings.plant).state_names) != 4:
+        return f"{method} is for plants of four states"
+    return train
+
+
+def _default_model(settings: Settings, screen: Screen) -> Path | None:
+    """The newest finished run of the plant, one with a hierarchy before one without, or the zoo's.
+
+    Of the zoo the model with the settings' strides, if there is one.
+    """
+
+    def fits(directory: Path, several: bool) -> bool:
+        config = runs.read_config(directory)
+        strides = {config.get("hierarchy", {}).get(name) for name in ("h", "m", "l")}
+        return config.get("plant") == settings.plant and (len(strides) > 1 or not several)
+
+    for several in (True, False):
+        directory = runs.newest_run("train-hierarchy", lambda run, s=several: fits(run, s))
+        if directory:
+            screen.say(f"model of the newest run, {directory}")
+            return directory / MODEL_FILE
+    hierarchy = settings.hierarchy
+    path = zoo.find_model(settings.plant, (hierarchy.h, hierarchy.m, hierarchy.l))
+    if path:
+        screen.say(f"no run of train-hierarchy here: model {path.parent.name} of the zoo")
+        return path
+    screen.say(f"no model of plant {settings.plant}: true-state methods only")
+    return None
+
+
+def _find(methods: Sequence[str], settings: Settings, screen: Screen) -> list[Path]:
+    """A model for each method that has one: of the newest run, else of the zoo."""
+    missing, found = list(methods), []
+    for path in _candidates():
+        if not missing:
+            break
+        held = _held(path, settings.plant)
+        if taken := [name for name in missing if name in held]:
+            found.append(path)
+            screen.say(f"{', '.join(taken)}: model {path}")
+            missing = [name for name in missing if name not in held]
+    return found
+
+
+def _candidates() -> Iterator[Path]:
+    """The models of all finished training runs below ``runs/``, newest first; then the zoo's."""
+    for directory in runs.finished_runs(*TRAINING):
+        if (directory / MODEL_FILE).is_file():
+            yield directory / MODEL_FILE
+    yield from map(zoo.resolve_model, zoo.list_models())
+
+
+def _held(path: Path, plant_name: str) -> tuple[str, ...]:
+    """The methods that a checkpoint offers to a plant; none if it is damaged or of another one."""
+    with contextlib.suppress(HjepaError, KeyError, TypeError):
+        metadata = load_checkpoint(path).metadata
+        if metadata["plant"] == plant_name:
+            return offered(metadata["architecture"], len(plant(plant_name).state_names))
+    return ()
