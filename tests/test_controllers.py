@@ -13,12 +13,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.checks import ANCHORS, TRUE_STATE
 from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
 from hjepa_cli.core.dynamics import rk4_step
 from hjepa_cli.core.loop import Controller, Draws, every_step, gap_schedule, simulate
-from hjepa_cli.core.methods import embedding_method, true_state_method
+from hjepa_cli.core.methods import build_method, true_state_method
 from hjepa_cli.core.model import Model, build_modules
 from hjepa_cli.core.plant import CartPole, CartPoles, plant
 from hjepa_cli.core.policy import teacher
@@ -199,10 +199,11 @@ def untrained_model() -> Model:
 
 def embedding_controllers() -> dict[str, Controller]:
     model = untrained_model()
-    return {
-        name: embedding_method(name, model, Integers(256, 8)).controller(2)
-        for name in model.methods
-    }
+    few = {"collect.trajectories": 2, "collect.test_trajectories": 2, "collect.steps": 8}
+    settings = load_settings(flags=few)
+    built = {name: build_method(name, settings, model).controller(2) for name in model.methods}
+    assert set(ANCHORS) < built.keys()
+    return built
 
 
 @pytest.mark.parametrize("build", [controllers, embedding_controllers])
@@ -246,8 +247,8 @@ class Spy:
 
 def sensor_of(name: str) -> Any:
     if name == "stride":
-        return lambda previous, states: torch.from_numpy(states).float()
-    return lambda previous, states: states
+        return lambda seen: torch.from_numpy(seen[:, -1]).float()
+    return lambda seen: seen[:, -1]
 
 
 def test_teacher_is_the_optimal_method() -> None:

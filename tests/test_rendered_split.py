@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from hjepa_cli.core.batches import FrameWindows
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.codecs import Integers
-from hjepa_cli.core.sensors import embedding_sensor
 from hjepa_cli.core.plant import plant
+from hjepa_cli.core.sensors import embedding_sensor
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
 from hjepa_cli.stages.inputs import CHUNK, RenderedSplit, embed, render
@@ -214,7 +214,7 @@ def test_mirror_images_come_with_negated_actions_and_labels() -> None:
 
 
 def test_the_standardisation_sample_crosses_no_trajectory() -> None:
-    sample = standardisation_sample(painted(7, 10).frames, pairs=1000)[:, :, 0, 0].long()
+    sample = standardisation_sample(painted(7, 10).frames, 1000)[:, :, 0, 0].long()
     assert torch.equal(sample[:, 1, 0], sample[:, 0, 0] + 1)
     assert torch.equal(sample[:, 1, 1], sample[:, 0, 1])
     assert len(sample) == 7 * 10

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 from test_cell import entry
 
+from hjepa_cli.checks import split_late
 from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
@@ -32,7 +33,7 @@ def stage(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     calls = []
 
-    def open_subject(settings, screen, checkpoint, dataset):
+    def open_subject(settings, screen, checkpoint, dataset, further=None):
         if checkpoint == "missing":
             raise MissingInputError("no model 'missing'")
         skipped = {name: "train it" for name in settings.methods if name not in ENTRIES}
@@ -40,14 +41,15 @@ def stage(tmp_path, monkeypatch):
             settings=settings,
             asked=(checkpoint, dataset),
             skipped=lambda methods: skipped,
+            measurable=lambda methods: [name for name in methods if name in ENTRIES],
             inputs=lambda **flags: flags,
         )
 
     def curves_for(subject, screen, record, **arguments):
         calls.append((*subject.asked, arguments))
-        methods = subject.settings.methods
-        found = {name: ENTRIES[name] for name in methods if name in ENTRIES}
-        return {"checkpoint": "model", "methods": found, "source": "curves of the test"}
+        found = {name: ENTRIES[split_late(name)[0]] for name in arguments["methods"]}
+        model = {"checkpoint": "model", "checkpoints": {}}
+        return model | {"methods": found, "source": "curves of the test"}
 
     monkeypatch.setattr(scale, "open_subject", open_subject)
     monkeypatch.setattr(scale, "curves_for", curves_for)
@@ -86,6 +88,28 @@ def test_document(stage):
     assert rows["hjepa"]["devices"] == 7225 and rows["zero"]["devices"] == 0
     assert rows["optimal"]["devices"] is None and rows["oracle"]["at_least"]
     assert rows["zero"]["reason"] and not rows["hjepa"]["reason"]
+
+
+def test_raw_frames_are_as_late_as_they_take_slots(stage, monkeypatch):
+    bits = 2 * 64 * 128 * 3 * 8
+    monkeypatch.setitem(ENTRIES, "supervised-2", entry(gap=30.0, p=0.1, bits=bits))
+    monkeypatch.setitem(ENTRIES, "local", entry(gap=320.0, p=1 / 320, bits=0, censored=True))
+    result = stage(methods=("supervised-2", "local"), verify=False)
+    assert stage.curves[0][2]["methods"] == [
+        *("supervised-2+6", "local", "supervised-2+4", "supervised-2+3", "supervised-2+2")
+    ]
+    for row in result["rows"]:
+        if row["method"] == "local":
+            assert row["devices"] is None and "sends nothing" in row["reason"]
+            continue
+        slots = bits / (20e6 * 1e-3 * math.log2(1 + 10 ** (row["snr_db"] / 10)))
+        assert row["delay_steps"] == math.ceil(slots)
+        assert row["devices"] == math.floor(30.0 / slots)
+    assert "supervised-2, 6 steps late" in stage.out.getvalue()
+    stage(methods=("supervised-2",), law="equal")
+    assert stage.curves[1][2]["methods"] == ["supervised-2"]
+    wide = {"radio.bandwidth_hz": 1e9}  # a slot carries a whole packet
+    assert stage(methods=("supervised-2",), config=wide)["rows"][0]["delay_steps"] == 0
 
 
 def test_gains_stand_beside_the_papers(stage):
@@ -178,7 +202,9 @@ def test_a_finished_run_is_shown_again_without_measuring(stage, tmp_path):
 
 def test_flags_reach_the_curves(stage, tmp_path):
     stage(remeasure=True, dataset=tmp_path / "data", checkpoint="zoo-name")
-    assert stage.curves == [("zoo-name", tmp_path / "data", {"remeasure": True})]
+    [(name, data, arguments)] = stage.curves
+    assert (name, data) == ("zoo-name", tmp_path / "data")
+    assert arguments["remeasure"] is True
 
 
 def test_without_matplotlib_the_table_stays_and_the_pip_line_is_named(stage, monkeypatch):

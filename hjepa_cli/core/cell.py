@@ -116,6 +116,7 @@ class Cell:
         return row
 
     def _devices(self, need: Need, tolerance: float, snr_db: float) -> int:
+        assert need.payload_bits is not None
         link = (need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
         if self.law == "equal":
             return int(equal_devices(tolerance, *link, noise=self.noise))

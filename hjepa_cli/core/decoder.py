@@ -63,7 +63,7 @@ class Decoder(nn.Module):
         if self.symmetric:
             x = unflatten_twins(x, channels, height, width)
         else:
-            x = x.unflatten(1, (channels, height, width))
+            x = x.reshape(-1, channels, height, width)
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             x = F.relu(norm(convolution(F.interpolate(x, scale_factor=2.0))))
         weight = self.paint.weight
@@ -77,4 +77,5 @@ class Decoder(nn.Module):
 
     def restore(self, z: Tensor) -> Tensor:
         """Embeddings [N, D] → the encoder's inputs [N, 3κ, 64, 128], in grey levels."""
-        return self(z) * self.input_std[:, None, None] + self.input_mean[:, None, None]
+        painted: Tensor = self(z)
+        return painted * self.input_std[:, None, None] + self.input_mean[:, None, None]

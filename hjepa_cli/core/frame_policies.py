@@ -89,7 +89,7 @@ class Reconstruction:
         return {"reconstruction": self.error(batch.frames)}
 
     def error(self, frames: Tensor) -> Tensor:
-        """Mean squared error of frames [N, κ, 64, 128, 3], 1 where nothing but the mean is known."""
+        """Mean squared error of frames [N, κ, 64, 128, 3]; 1: no better than the mean."""
         inputs = self.encoder.inputs(frames.to(self.device))
         painted = self.decoder(self.encoder.embed(inputs))
         return F.mse_loss(painted, self.decoder.standardise(inputs))

@@ -117,7 +117,7 @@ class StateCodec:
     @property
     def step(self) -> Floats:
         """Width of a level [S]."""
-        return 2 * self.reach / 2**STATE_BITS
+        return np.asarray(2 * self.reach / 2**STATE_BITS)
 
     def send(self, states: Floats) -> Floats:
         """States [n, S] → what the controller receives [n, S]: the middles of their levels."""
@@ -195,4 +195,4 @@ def identify(states: Floats, actions: Floats) -> tuple[Floats, Floats, Floats, F
 def _decode(weights: Tensor, data: Typical) -> Floats:
     """Decoded states [N, T, S]."""
     read = read_probe(weights, data.z.flatten(0, 1))
-    return np.asarray(read.unflatten(0, data.z.shape[:2]).numpy())
+    return np.asarray(read.reshape(*data.z.shape[:2], -1).numpy())

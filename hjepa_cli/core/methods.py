@@ -1,9 +1,9 @@
 """What each method name means: what its devices send, and what its controller does with it.
 
 Methods on embeddings send Ψ(previous frame, current frame), really rendered, encoded, quantised
-and dequantised. Methods on raw frames send the pictures. Methods on the true state are anchors: what
-prediction could gain at best (``oracle``), what it has to beat (``hold-true``, ``zero-true``), and
-the teacher (``optimal``).
+and dequantised. Methods on raw frames send the pictures. Methods on the true state are anchors:
+what prediction could gain at best (``oracle``), what it has to beat (``hold-true``,
+``zero-true``), and the teacher (``optimal``).
 """
 
 import dataclasses

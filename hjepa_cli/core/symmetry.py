@@ -205,5 +205,5 @@ def flatten_twins(x: Tensor) -> Tensor:
 
 def unflatten_twins(x: Tensor, channels: int, height: int, width: int) -> Tensor:
     """The inverse of :func:`flatten_twins`: twins [N, C · H · W] → maps of twins [N, C, H, W]."""
-    right, left = x.unflatten(1, (channels, height, width)).chunk(2, dim=1)
+    right, left = x.reshape(-1, channels, height, width).chunk(2, dim=1)
     return torch.cat([right, left.flip(-1)], dim=1)

@@ -46,7 +46,7 @@ def typical(model: "Model", settings: Settings, split: str) -> Typical:
     seen = frames_seen(np.arange(steps), model.frames)
     z = embed_states(model, drawn.states[:, seen].reshape(count * steps, *seen.shape[1:], -1))
     return Typical(
-        z.unflatten(0, (count, steps)),
+        z.reshape(count, steps, -1),
         drawn.states[:, 1:].astype(np.float64),
         drawn.applied_n.reshape(count, steps, -1).astype(np.float64) / kind.force_limit_n,
     )

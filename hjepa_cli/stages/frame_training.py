@@ -1,4 +1,4 @@
-"""Training on camera frames: the loop that the JEPA and the baselines of ``train-encoder`` share."""
+"""Training on camera frames: the loop that all methods of ``train-encoder`` share."""
 
 import dataclasses
 from collections.abc import Callable, Iterator

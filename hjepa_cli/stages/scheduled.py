@@ -16,9 +16,9 @@ from hjepa_cli.core.scheduled import BLOCK_DEVICES
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.subject import open_subject
 from hjepa_cli.stages.scale import PAPER_GAIN_PERCENT, PAPER_SNR_DB, draw, enforce, write_csv
 from hjepa_cli.stages.scheduled_cell import ScheduledCell
+from hjepa_cli.stages.subject import open_subject
 from hjepa_cli.storage.runs import Run
 
 COLUMNS = (

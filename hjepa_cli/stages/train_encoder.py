@@ -18,7 +18,7 @@ from hjepa_cli.core.jepa import Jepa
 from hjepa_cli.core.model import build_modules, tensors_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.predictors import Predictor
-from hjepa_cli.core.ranks import ALONE, Ranks, joined
+from hjepa_cli.core.ranks import Ranks, joined
 from hjepa_cli.core.shared_norm import share_statistics
 from hjepa_cli.core.training import fit_actor, resolve_device
 from hjepa_cli.errors import NumericalError, UsageError
