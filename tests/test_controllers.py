@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjepa_cli.checks import ANCHORS, TRUE_STATE
-from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.controllers import LastForce, Oracle, StrideController
 from hjepa_cli.core.dynamics import rk4_step
 from hjepa_cli.core.loop import Controller, Draws, every_step, gap_schedule, simulate

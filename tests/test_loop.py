@@ -17,6 +17,7 @@ from hjepa_cli.core.loop import (
     delivery_schedule,
     every_step,
     gap_schedule,
+    last_states,
     noise_per_step,
     play,
     simulate,
@@ -323,3 +324,53 @@ def test_play_delivers_one_packet_to_every_device() -> None:
     assert [sorted(packets) for packets in recorder.packets] == [[0, 1, 2], [], [], []]
     assert recorder.packets[0] == {0: 7, 1: 8, 2: 9}
     assert forces == pytest.approx(np.tile([0.1, 0.2, 0.3, 0.4], (3, 1)))
+
+
+@pytest.mark.parametrize("delay", [1, 3, 6])
+def test_late_packets_by_brute_force(delay: int) -> None:
+    """A plain loop per device: what was sensed at k acts at k + delay, nothing acts before."""
+    draws = Draws.make(protocol(), 3, seed=5)
+    schedules = np.stack([gap_schedule(1, 60, 3), gap_schedule(7.5, 60, 3)])
+    act = teacher("desktop")
+    outcome = simulate(
+        DESKTOP, draws, schedules, LastForce(act, 6, keep=True), true_state, delay_steps=delay
+    )
+    for point in range(2):
+        for device in range(3):
+            poles = CartPoles(DESKTOP, 1)
+            poles.states = draws.initial[device : device + 1]
+            poles.step([0.0])
+            sent: dict[int, float] = {}
+            force = cost = 0.0
+            for k in range(60):
+                if schedules[point, k, device]:
+                    sent[k] = float(act(poles.states[0]))
+                force = sent.get(k - delay, force)
+                cost += float(DESKTOP.cost(poles.states[0], np.array(force)))
+                poles.step([force])
+                poles.states = poles.states + draws.noise[k, device]
+            assert outcome.cost[point, device] == pytest.approx(cost / 60, rel=1e-9)
+
+
+def test_a_late_packet_is_played_late() -> None:
+    recorder = Recorder(2)
+    play(recorder, np.array([7, 8]), 2, 5, delay_steps=3)
+    assert [sorted(packets) for packets in recorder.packets] == [[], [], [], [0, 1], []]
+
+
+def test_rollouts_and_the_loop_look_back_alike() -> None:
+    """What a sensor gets in step k is the same states, stored or simulated."""
+    draws = Draws.make(protocol(steps=6), 2, seed=0)
+    seen: list[np.ndarray] = []
+    rollouts = [draws.initial]
+    simulate(
+        DESKTOP,
+        draws,
+        every_step(6, 2)[None],
+        LastForce(teacher("desktop"), 2, keep=True),
+        lambda states: [seen.append(states), states[:, -1]][1],
+        watch=lambda k, states, forces_n: rollouts.append(states),
+    )
+    stored = np.stack(rollouts, axis=1)
+    for k in range(6):
+        assert last_states(stored, k) == pytest.approx(seen[k], abs=1e-12)

@@ -111,5 +111,5 @@ def rollout_error(latent: LinearLatent, data: Typical) -> float:
     total = 0.0
     for k in range(data.z.shape[1] - 1):
         z = latent.step(z, actions[:, k])
-        total += float((normalise(z) - data.z[:, k + 1]).square().mean())
+        total += float((normalise(z) - normalise(data.z[:, k + 1])).square().mean())
     return total if np.isfinite(total) else np.inf
