@@ -29,6 +29,11 @@ RATES_PER_S = {  # two cores of a server CPU
     "device-steps on embeddings": 50_000.0,
     "device-steps on states": 300_000.0,
 }
+TRAINED = {  # by train-encoder --method: loops, and what they train
+    "jepa": (1, "the encoder"),
+    "supervised": (1, "frames to force"),
+    "autoencoder": (2, "reconstruction, then reconstructed frames to force,"),
+}
 SEARCH_POINTS = 6  # of a tolerance, as a rule
 
 SEARCH_LOADS, BLOCK_DEVICES = 8, 200  # of the law scheduled, as in core/scheduled.py
@@ -101,13 +106,14 @@ def plan_train_encoder(settings: Settings, dataset: Path | None, out: Path | Non
     batch = options.batch_trajectories * options.batch_frames
     frames = _frames(settings)
     epochs = options.steps * batch / max(frames, 1)
+    loops, what = TRAINED[options.method]
     return Plan(
         command="train-encoder",
         reads=[_dataset(dataset, settings)],
         work=[
             f"render about {frames} frames",
-            f"train the encoder for {options.steps} steps of {batch} frames "
-            f"({epochs:.0f} passes over the data), h = {options.h}",
+            f"train {what} for {loops * options.steps} steps of {batch} frames "
+            f"({loops * epochs:.0f} passes over the data), h = {options.h}",
             f"examine its health {'and stop at a missed gate' if options.gate else '(no gate)'}",
         ],
         writes=[f"run {_run('train-encoder', out)}"],
@@ -116,7 +122,7 @@ def plan_train_encoder(settings: Settings, dataset: Path | None, out: Path | Non
         + _seconds(
             {
                 "rendered frames": frames,
-                "encoder training frames": options.steps * batch,
+                "encoder training frames": loops * options.steps * batch,
                 "encoded frames": (epochs / 4 + 3) * frames,
             }
         ),
@@ -129,15 +135,21 @@ def plan_train_hierarchy(
     """Plan of ``hjepa train-hierarchy``."""
     options = settings.hierarchy
     frames = _frames(settings)
-    steps = options.coarse_steps + options.flat_steps + options.medium_steps + options.low_steps
-    parameters = ENCODER_PARAMETERS + 4 * _predictor(settings, options.h)
+    h, m, l = options.h, options.m, options.l
+    if h == m == l:
+        levels = f"one level (h = {h})"
+        steps = options.flat_steps + (options.coarse_steps if h > 1 else 0)
+    else:
+        levels = f"P^H, P^M, P^L (h, m, l = {h}, {m}, {l})"
+        steps = options.coarse_steps + options.flat_steps
+        steps += options.medium_steps + options.low_steps
+    parameters = ENCODER_PARAMETERS + (2 if h == m == l else 4) * _predictor(settings, h)
     return Plan(
         command="train-hierarchy",
         reads=[_dataset(dataset, settings), _encoder(encoder, settings)],
         work=[
             f"render and encode about {frames} frames",
-            f"train P^H, P^M, P^L (h, m, l = {options.h}, {options.m}, {options.l}), "
-            f"ts-jepa-1 and the actor ({steps} steps)",
+            f"train {levels}, ts-jepa-1 and the actor ({steps} steps)",
         ],
         writes=[f"run {_run('train-hierarchy', out)}"],
         writes_bytes=4 * parameters,
@@ -162,11 +174,12 @@ def plan_eval(
 ) -> Plan:
     """Plan of ``hjepa eval``."""
     subject = _subject(settings, checkpoint, dataset)
-    missing = _uncached(subject, remeasure=remeasure)
+    methods = subject.measurable(settings.methods)
+    missing = _uncached(subject, methods, remeasure=remeasure)
     return Plan(
         command="eval",
         reads=[f"model {subject.name}", _clean(dataset, settings)],
-        work=_loop_lines(subject, missing),
+        work=_loop_lines(subject, methods, missing),
         writes=[f"run {_run('eval', out)}"],
         writes_bytes=200_000,
         seconds=5 + _loop_seconds(settings, missing),
@@ -188,10 +201,10 @@ def plan_scale(
     subject = _subject(settings, checkpoint, dataset)
     if radio.law == "scheduled":
         return _plan_scheduled(settings, subject, out, snr_db)
-    missing = _uncached(subject, remeasure=remeasure)
-    methods = subject.measurable(settings.methods)
+    methods = _timed(subject, snr_db)
+    missing = _uncached(subject, methods, remeasure=remeasure)
     work = [
-        *_loop_lines(subject, missing),
+        *_loop_lines(subject, methods, missing),
         f"count devices by law '{radio.law}' at {', '.join(f'{value:g}' for value in snr_db)} dB "
         f"in {radio.bandwidth_hz / 1e6:g} MHz for {len(methods)} methods",
     ]
@@ -324,17 +337,25 @@ def _subject(settings: Settings, checkpoint: str | None, dataset: Path | None) -
     return open_subject(settings, Screen(quiet=True), checkpoint, dataset)
 
 
-def _uncached(subject: "Subject", *, remeasure: bool) -> list[str]:
+def _timed(subject: "Subject", snr_db: list[float]) -> list[str]:
+    """The methods as ``scale`` drives them: raw frames late."""
+    from hjepa_cli.stages.scale import all_timed
+
+    at = all_timed(subject, snr_db).values()
+    return list(dict.fromkeys(name for names in at for name in names))
+
+
+def _uncached(subject: "Subject", methods: list[str], *, remeasure: bool) -> list[str]:
     """The methods whose curves the stage would measure."""
     from hjepa_cli.stages.evaluate import cached
 
-    found = {} if remeasure else cached(subject)
-    return [name for name in subject.measurable(subject.settings.methods) if name not in found]
+    found = {} if remeasure else cached(subject, methods)
+    return [name for name in methods if name not in found]
 
 
-def _loop_lines(subject: "Subject", missing: list[str]) -> list[str]:
+def _loop_lines(subject: "Subject", methods: list[str], missing: list[str]) -> list[str]:
     options = subject.settings.protocol
-    known = [name for name in subject.measurable(subject.settings.methods) if name not in missing]
+    known = [name for name in methods if name not in missing]
     lines = [f"take the cached curves of {', '.join(known)}"] if known else []
     if missing:
         lines.append(

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import check_methods, split_late
+from hjepa_cli.checks import TRUE_STATE, check_methods, split_late
 from hjepa_cli.core.bench import Bench, control_entry, control_errors
 from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
 from hjepa_cli.core.methods import build_method
@@ -103,7 +103,7 @@ def curves_for(
     found: dict[str, tuple[Entry, Path]] = {}
     for one, names in subject.shared_out(methods):
         found |= _curves_of(one, names, screen, record, remeasure=remeasure, first=one is subject)
-    paths = {name: subject.of(name).path for name in methods}
+    paths = {name: subject.of(name).path for name in methods if name not in TRUE_STATE}
     return {
         "checkpoint": subject.path,
         "checkpoints": {name: path for name, path in paths.items() if path},
@@ -144,10 +144,10 @@ def _curves_of(
     return found
 
 
-def cached(subject: Subject) -> dict[str, tuple[Entry, Path]]:
-    """The curves of the settings' methods that were measured before, and where they are."""
+def cached(subject: Subject, methods: Sequence[str]) -> dict[str, tuple[Entry, Path]]:
+    """The curves of measurable methods that were measured before, and where they are."""
     found: dict[str, tuple[Entry, Path]] = {}
-    for one, names in subject.shared_out(subject.measurable(subject.settings.methods)):
+    for one, names in subject.shared_out(methods):
         found |= curves.find(one.digest, names, one.beside)
     return found
 

@@ -205,7 +205,7 @@ def hierarchy_section(result: Mapping[str, Any]) -> list[str]:
             f"{result['seconds']:.0f} s."
         ),
         html.table(
-            ["steps since the packet", "NMAE of hjepa"],
+            ["steps since the packet", f"NMAE of {result.get('method', 'hjepa')}"],
             [[window, float(error)] for window, error in result["nmae_windows"].items()],
         ),
     ]
@@ -238,8 +238,16 @@ def eval_section(result: Mapping[str, Any]) -> list[str]:
             f"tolerances from {first['n_devices']} devices; NMAE over {first['n_rollouts']} "
             "rollouts. In brackets: 95 % bootstrap intervals."
         ),
+        *_models(result),
         html.table(columns, rows),
     ]
+
+
+def _models(result: Mapping[str, Any]) -> list[str]:
+    """Where methods come from that the first model does not hold."""
+    paths = result.get("checkpoints", {}).items()
+    others = [f"{name}: {path}" for name, path in paths if path != result["checkpoint"]]
+    return [html.paragraph(f"Of other models: {'; '.join(others)}.")] if others else []
 
 
 def scale_section(result: Mapping[str, Any]) -> list[str]:

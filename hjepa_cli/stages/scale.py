@@ -81,8 +81,7 @@ def run(
             show(record.result, screen)
             enforce(record.result.get("verify", []), level)
             return record.result
-        cell, methods = cell_of(settings), subject.measurable(settings.methods)
-        wanted = {snr_db: [timed(name, cell, snr_db) for name in methods] for snr_db in grid_db}
+        cell, wanted = cell_of(settings), all_timed(subject, grid_db)
         names = list(dict.fromkeys(name for at in wanted.values() for name in at))
         measured = curves_for(subject, screen, record, remeasure=remeasure, methods=names)
         needs = {
@@ -141,6 +140,12 @@ def cell_of(settings: Settings) -> Cell:
     radio, chosen = settings.radio, plant(settings.plant)
     limit_bits_per_s = chosen.data_rate_limit_bits_per_s
     return Cell(radio.law, radio.noise, radio.bandwidth_hz, chosen.step_s, limit_bits_per_s)
+
+
+def all_timed(subject: Subject, grid_db: Sequence[float]) -> dict[float, list[str]]:
+    """By SNR the methods that can be measured, each :func:`timed`."""
+    cell, methods = cell_of(subject.settings), subject.measurable(subject.settings.methods)
+    return {snr_db: [timed(name, cell, snr_db) for name in methods] for snr_db in grid_db}
 
 
 def timed(method: str, cell: Cell, snr_db: float) -> str:
