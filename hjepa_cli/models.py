@@ -81,6 +81,8 @@ def verify(screen: Screen, names: list[str]) -> Result:
 def missing_curves(model: ZooModel) -> list[str]:
     """The default methods that ``curves.json`` does not hold under the default protocol.
 
+    Of a baseline, which holds none of them, the method that it was trained for.
+
     Raises:
         DataError: not a model that can drive, or damaged curves.
     """
@@ -90,9 +92,11 @@ def missing_curves(model: ZooModel) -> list[str]:
 
     plant = model.metadata.get("plant")
     settings = load_settings(plant if plant in PRESETS else None)
-    subject = Subject(settings, Model.load(model.path), model.path, None)
+    held = Model.load(model.path)
+    subject = Subject(settings, held, model.path, None)
+    wanted = settings.methods if "hjepa" in held.methods else held.methods[:1]
     found = curves.read(model.path.with_name(CURVES_FILE), subject.digest)
-    return [name for name in subject.measurable(settings.methods) if name not in found]
+    return [name for name in subject.measurable(wanted) if name not in found]
 
 
 def _told(missing: list[str] | None) -> str:
@@ -122,7 +126,7 @@ def _summary(model: ZooModel) -> Result:
 def _row(model: Result) -> list[object]:
     if "error" in model:
         return [model["name"], f"damaged: {model['error']}", "", "", None, "", ""]
-    strides = "/".join(str(stride) for stride in model["strides"].values())
+    strides = "/".join(str(stride) for stride in model["strides"].values() if stride is not None)
     megabytes = f"{model['size_bytes'] / 1e6:.1f}"
     curves = "measured" if model["curves"] else "none"
     return [

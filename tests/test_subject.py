@@ -223,3 +223,19 @@ def test_baselines_in_the_zoo_are_no_default_model(tmp_path: Path) -> None:
     assert zoo.find_model("desktop") is None
     shipped = untrained(tmp_path / "zoo" / "hierarchy" / "model.safetensors")
     assert zoo.find_model("desktop") == shipped
+
+
+def test_curves_of_a_baseline_are_complete_with_its_own_method(
+    tmp_path: Path, quick_encoder: None
+) -> None:
+    from hjepa_cli.models import missing_curves
+    from hjepa_cli.storage import curves
+
+    path = saved(tmp_path / "zoo" / "raw" / "model.safetensors", of_method("supervised"))
+    assert missing_curves(zoo.verify_model("raw")) == ["supervised-2"]
+    measured = evaluate.run(small(methods=("supervised-2",), steps=6), Output().screen)
+    subject = open_subject(
+        load_settings(flags={"methods": ["supervised-2"]}), Output().screen, str(path), None
+    )
+    curves.write(path.with_name("curves.json"), subject.digest, measured["methods"])
+    assert missing_curves(zoo.verify_model("raw")) == []
