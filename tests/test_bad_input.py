@@ -53,15 +53,34 @@ def test_wrong_strides_name_the_right_ones(shell, h, m, l, choices, repaired):
 
 
 def test_the_hint_for_wrong_strides_works(shell):
-    hint = shell("train-hierarchy", "--h", "9").err.splitlines()[1]
+    hint = shell("train-hierarchy", "--h", "9", "--m", "2").err.splitlines()[1]
     arguments = hint.removeprefix("hint: hjepa ").split()
     assert shell(*arguments, "--dry-run").code == 0
 
 
-def test_h_alone_takes_the_presets_m_and_l_where_they_divide_it(shell):
+def test_h_alone_means_one_level_and_with_m_or_l_the_preset_has_the_rest(shell):
     assert "4, 2, 1" in shell("train-hierarchy", "--dry-run").out
-    assert "8, 2, 1" in shell("train-hierarchy", "--h", "8", "--dry-run").out
-    refused(shell, 2, "train-hierarchy", "--h", "7", says=["--m 2 does not divide --h 7", "1, 7"])
+    assert "one level (h = 7)" in shell("train-hierarchy", "--h", "7", "--dry-run").out
+    assert "8, 2, 1" in shell("train-hierarchy", "--h", "8", "--l", "1", "--dry-run").out
+    strides = ("--h", "7", "--l", "1")
+    refused(shell, 2, "train-hierarchy", *strides, says=["--m 2 does not divide --h 7", "1, 7"])
+
+
+@pytest.mark.parametrize(
+    ("method", "frames", "says"),
+    [
+        ("jepa", 4, "method jepa takes 2"),
+        ("supervised", 3, "method supervised takes 2 or 4"),
+        ("autoencoder", 4, "method autoencoder takes 2"),
+    ],
+)
+def test_each_method_takes_its_own_frames(shell, method, frames, says):
+    flags = ("--method", method, f"--frames={frames}")
+    refused(shell, 2, "train-encoder", *flags, says=[f"--frames {frames}: {says}"])
+
+
+def test_an_unknown_method_names_the_others(shell):
+    refused(shell, 2, "train-encoder", "--method", "gan", says=["jepa, supervised, autoencoder"])
 
 
 @pytest.mark.parametrize("value", ["0", "-4", "2.5", "nan", "four", ""])
