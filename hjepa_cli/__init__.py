@@ -21,6 +21,7 @@ _HOMES = {
     "load_settings": "hjepa_cli.settings",
     "predict": "hjepa_cli.api",
     "scale": "hjepa_cli.api",
+    "simulate_cell": "hjepa_cli.api",
     "teacher": "hjepa_cli.core.policy",
     "train_encoder": "hjepa_cli.api",
     "train_hierarchy": "hjepa_cli.api",
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
         load_model,
         predict,
         scale,
+        simulate_cell,
         train_encoder,
         train_hierarchy,
     )
@@ -56,6 +58,7 @@ __all__ = [
     "load_settings",
     "predict",
     "scale",
+    "simulate_cell",
     "teacher",
     "train_encoder",
     "train_hierarchy",

@@ -1,4 +1,4 @@
-"""Animations of closed loops: pictures of all devices, as GIF, as MP4 or in the terminal.
+"""Animations of closed loops: pictures of all devices, as GIF or MP4.
 
 One row per method, one panel per device: the camera's picture of the true cart-pole, over it the
 pole that the controller believes in (dashed, black), the age of its last packet and the SNR, and a
@@ -8,10 +8,9 @@ strip with one column per slot: a full bar is a packet that arrived, a tick one 
 import contextlib
 import os
 import subprocess
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +28,12 @@ if TYPE_CHECKING:
 FORMATS = (".gif", ".mp4")
 SCALE = 2  # a frame's pixel is so many of the picture
 PANEL_PX = (WIDTH_PX * SCALE, HEIGHT_PX * SCALE + 16 + 14)  # text above, strip below
-MARGIN_PX, TITLE_PX, HEADER_PX = 8, 18, 34
-LEAST_WIDTH_PX = 520  # for the legend
+MARGIN_PX, TITLE_PX, HEADER_PX = 8, 20, 34
+LEAST_WIDTH_PX = 600  # for the legend
+TEXT, NAME = font(12), font(14)  # below 12 px, Pillow's letters swallow the blanks
 ARRIVED, LOST = (0, 158, 115), (213, 94, 0)  # safe for colour-blind readers
 DASH_PX = 7
 COLOURS = 48  # of a GIF
-TERMINAL_COLUMNS, TERMINAL_ROWS = 32, 8  # characters of a panel; two pixels to a character
 
 
 class Pictures:
@@ -49,6 +48,7 @@ class Pictures:
 
     def __init__(self, films: "Sequence[Film]", link: "Link", kind: System, every: int) -> None:
         self.films, self.link, self.kind = films, link, kind
+        self.every = every
         self.steps = list(range(0, len(link.delivered), every))
         self._camera = kind.camera()
         self.devices = link.delivered.shape[1]
@@ -67,16 +67,16 @@ class Pictures:
         picture = Image.new("RGB", self.size_px, PAPER)
         draw = ImageDraw.Draw(picture)
         clock = f"t = {1e3 * k * self.kind.step_s:.0f} ms   {self.link.label}"
-        draw.text((MARGIN_PX, 3), clock, FAINT, font())
+        draw.text((MARGIN_PX, 3), clock, FAINT, TEXT)
         legend = "dashed: what the controller believes; bar: packet arrived"
         legend += "; tick: lost" if self.link.sends_always else ""
-        draw.text((MARGIN_PX, 17), legend, FAINT, font())
+        draw.text((MARGIN_PX, 19), legend, FAINT, TEXT)
         for row, shot in enumerate(self.films):
             top = HEADER_PX + MARGIN_PX + row * (PANEL_PX[1] + TITLE_PX + MARGIN_PX)
             score = shot.score[: k + 1].mean()
-            draw.text((MARGIN_PX, top), shot.method, INK, font(13))
-            draw.text((MARGIN_PX + 90, top + 2), f"{score:.0%} of the time inside the band", FAINT,
-                      font())  # fmt: skip
+            draw.text((MARGIN_PX, top), shot.method, INK, NAME)
+            said = f"{score:.0%} of the time inside the band"
+            draw.text((MARGIN_PX + NAME.getlength(shot.method) + 16, top + 2), said, FAINT, TEXT)
             for device in range(self.devices):
                 left = MARGIN_PX + device * (PANEL_PX[0] + MARGIN_PX)
                 panel = self._panel(shot, device, k)
@@ -92,35 +92,39 @@ class Pictures:
         (frame,) = self._camera.render(shot.states[k, device][None])
         return frame
 
-    def caption(self, device: int, k: int) -> str:
-        """Age of the last packet and SNR of this slot."""
-        age_ms = 1e3 * self.age_steps(device, k) * self.kind.step_s
-        snr_db = self.link.snr_db[k, device]
-        return f"packet {age_ms:.0f} ms old   SNR {snr_db:.0f} dB"
+    def age_ms(self, device: int, k: int) -> float:
+        """The same in milliseconds."""
+        return 1e3 * self.age_steps(device, k) * self.kind.step_s
+
+    def sketch(self, shot: "Film", device: int, k: int) -> list[NDArray[np.float64]]:
+        """The believed state as lines over a frame, in its pixels."""
+        return self._camera.sketch_px(shot.believed[k, device])
 
     def error(self, shot: "Film", device: int, k: int) -> str:
-        """How far the belief is off in the first angle, else in the first state."""
+        """How far off the belief is in the first angle, else in the first state."""
         names, units = self.kind.state_names, self.kind.state_units
         which = units.index("rad") if "rad" in units else 0
         error = shot.believed[k, device, which] - shot.states[k, device, which]
         if units[which] == "rad":
-            return f"believed − true {names[which]}: {np.degrees(error):+.1f}°"
-        return f"believed − true {names[which]}: {error:+.2g} {units[which]}"
+            return f"{names[which]} off by {np.degrees(error):+.1f}°"
+        return f"{names[which]} off by {error:+.2g} {units[which]}"
 
     def _panel(self, shot: "Film", device: int, k: int) -> Image.Image:
         panel = Image.new("RGB", PANEL_PX, PAPER)
         draw = ImageDraw.Draw(panel)
-        draw.text((0, 1), f"device {device}   {self.caption(device, k)}", INK, font())
+        age_ms, snr_db = self.age_ms(device, k), self.link.snr_db[k, device]
+        caption = f"device {device}   packet {age_ms:.0f} ms old   SNR {snr_db:.0f} dB"
+        draw.text((0, 0), caption, INK, TEXT)
         scene = Image.fromarray(self.frame(shot, device, k))
         scene = scene.resize((WIDTH_PX * SCALE, HEIGHT_PX * SCALE), Image.Resampling.BOX)
-        self._draw_belief(ImageDraw.Draw(scene), shot.believed[k, device])
+        self._draw_belief(ImageDraw.Draw(scene), self.sketch(shot, device, k))
         panel.paste(scene, (0, 16))
         self._draw_slots(draw, device, k, 16 + HEIGHT_PX * SCALE + 2, PANEL_PX[1] - 1)
         return panel
 
-    def _draw_belief(self, draw: ImageDraw.ImageDraw, state: NDArray[np.float64]) -> None:
+    def _draw_belief(self, draw: ImageDraw.ImageDraw, sketch: list[NDArray[np.float64]]) -> None:
         """The axis of the believed state as a dashed line, the rest of it as an outline."""
-        (start, end), *outlines = (line * SCALE for line in self._camera.sketch_px(state))
+        (start, end), *outlines = (line * SCALE for line in sketch)
         for line in outlines:
             draw.line([tuple(point) for point in line], fill=(0, 0, 0))
         way = end - start
@@ -174,62 +178,6 @@ def write(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) ->
         raise files.storage_error(path, error) from None
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def play(pictures: Pictures, fps: int) -> None:
-    """Show the animation in the terminal, as coloured half blocks."""
-    from rich.live import Live
-
-    with Live(refresh_per_second=fps, transient=False) as live:
-        for k in pictures.steps:
-            started_s = time.monotonic()
-            live.update(terminal_picture(pictures, k))
-            time.sleep(max(0.0, 1 / fps - (time.monotonic() - started_s)))
-
-
-def terminal_picture(pictures: Pictures, k: int) -> Any:
-    """One picture as a rich table: rows of methods, columns of devices."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table.grid(padding=(0, 2))
-    for shot in pictures.films:
-        score = shot.score[: k + 1].mean()
-        title = f"{shot.method}, {1e3 * k * pictures.kind.step_s:.0f} ms, {score:.0%} in the band"
-        table.add_row(Text(title, style="bold"))
-        table.add_row(
-            *(_half_blocks(pictures.frame(shot, device, k)) for device in range(pictures.devices))
-        )
-        captions = []
-        for device in range(pictures.devices):
-            arrived = pictures.link.delivered[k, device]
-            lost = pictures.link.sends_always and not arrived
-            mark, style = ("●", "green") if arrived else ("×" if lost else "·", "red")
-            caption = Text(f"{mark} ", style=style)
-            caption.append(pictures.caption(device, k), style="default")
-            caption.append(f"\n  {pictures.error(shot, device, k)}", style="dim")
-            captions.append(caption)
-        table.add_row(*captions)
-    return table
-
-
-def _half_blocks(frame: NDArray[np.uint8]) -> Any:
-    """A frame as text: each character shows two pixels, its colour and its background."""
-    from rich.text import Text
-
-    image = Image.fromarray(frame).crop((0, 16, WIDTH_PX, HEIGHT_PX))
-    size = (TERMINAL_COLUMNS, 2 * TERMINAL_ROWS)
-    pixels = np.asarray(image.resize(size, Image.Resampling.BOX))
-    text = Text()
-    for upper, lower in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True):
-        for above, below in zip(upper, lower, strict=True):
-            text.append("▀", style=f"{_rgb(above)} on {_rgb(below)}")
-        text.append("\n")
-    return text
-
-
-def _rgb(colour: Sequence[int]) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
 def _write_gif(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:

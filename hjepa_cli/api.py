@@ -4,7 +4,9 @@ Errors are those of :mod:`hjepa_cli.errors`. Values of settings are given by the
 in a TOML file: ``settings={"protocol.steps": 200}``; ``hjepa config show`` lists them.
 """
 
+import dataclasses
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,13 +17,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hjepa_cli.command import resolve
+from hjepa_cli.core import cell_loop
 from hjepa_cli.core.loop import Draws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.model import Model
 from hjepa_cli.core.plant import plant
+from hjepa_cli.core.uplink import Access
 from hjepa_cli.errors import UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
+from hjepa_cli.stages.scheduled_cell import CALIBRATION_SEED
 from hjepa_cli.storage import datasets, zoo
 
 Values = Mapping[str, Any]
@@ -140,6 +145,52 @@ def drive(
         "score": outcome.score[0],
         "cost": outcome.cost[0],
     }
+
+
+def simulate_cell(
+    method: str,
+    *,
+    devices: int,
+    blocks: int = 1,
+    scheduler: str = "round-robin",
+    model: Model | None = None,
+    preset: str | None = None,
+    settings: Values | None = None,
+) -> dict[str, Any]:
+    """Drive devices that compete for one uplink, as ``hjepa scale --law scheduled`` does.
+
+    Args:
+        method: as on the command line; those on embeddings need ``model``.
+        devices: N, that share
+        blocks: J resource blocks in every slot, each as long as a packet.
+        scheduler: who gets them.
+        model: of :func:`load_model`.
+        preset, settings: plant, seed and protocol (its steps K); of ``radio``, the power margin,
+            how long fades last and the share of transmissions that fail.
+
+    Returns:
+        ``score`` [N] (share of steps inside the band), ``cost`` [N] (mean capped quadratic cost),
+        ``packets`` [N] that arrived, ``reports`` of all devices to a scheduler that asks for them.
+
+    Raises:
+        UsageError: unknown method or scheduler, or more blocks than devices.
+    """
+    chosen = _settings(preset, None, settings)
+    kind, protocol, radio = plant(chosen.plant), chosen.protocol, chosen.radio
+    how = build_method(method, chosen, model)
+    access = Access(
+        scheduler=scheduler,
+        blocks=blocks,
+        margin_db=radio.power_margin_db,
+        k_factor_db=-math.inf,
+        coherence_slots=radio.coherence_slots,
+        block_error=radio.block_error,
+        growth=cell_loop.measure_growth(kind, protocol, chosen.seed + CALIBRATION_SEED, how),
+        seed=chosen.seed,
+    )
+    outcome = cell_loop.simulate_cell(kind, protocol, chosen.seed, devices, access, how)
+    named = dataclasses.asdict(outcome)
+    return {key: named[key] for key in ("score", "cost", "packets", "reports")}
 
 
 def collect(

@@ -19,6 +19,7 @@ from typer.main import get_command
 from hjepa_cli import __version__, options, plan, torchrun
 from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, resolve
 from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
+from hjepa_cli.plan import Plan
 from hjepa_cli.screen import Screen, one_line
 from hjepa_cli.tools import config_app, data_app, report, reproduce, view
 
@@ -429,6 +430,7 @@ def resume(
     cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
     debug: options.Debug = False,
 ) -> None:
     """Take up an interrupted run: same settings, same inputs, same result."""
@@ -439,7 +441,12 @@ def resume(
 
         return run(directory, screen)
 
-    execute(screen, stage, workers=workers, cluster=cluster, shared=True)
+    def planned() -> Plan:
+        from hjepa_cli.stages.resume import planned
+
+        return planned(directory)
+
+    execute(screen, stage, planned, dry_run=dry_run, workers=workers, cluster=cluster, shared=True)
 
 
 app.command(rich_help_panel=PIPELINE)(reproduce)

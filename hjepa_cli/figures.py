@@ -48,30 +48,59 @@ METADATA: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Style:
-    """How one method is drawn everywhere. Hollow markers: controllers that see the true state."""
+    """How one method is drawn everywhere. Hollow markers: controllers that see the true state.
+
+    Curves of equally good methods lie on each other. So solid lines with large markers are drawn
+    first, dashed ones with smaller markers over them, and all stay visible.
+    """
 
     colour: str  # Okabe and Ito's palette, safe for colour-blind readers
     marker: str
     line: Any = "-"
     hollow: bool = False
+    size: float = 4.0  # of the marker, in points
+
+    def looks(self, scale: float = 1.0) -> dict[str, Any]:
+        """What ``Axes.plot`` takes."""
+        return {
+            "color": self.colour,
+            "linestyle": self.line,
+            "marker": self.marker,
+            "markersize": scale * self.size,
+            "markerfacecolor": "none" if self.hollow else self.colour,
+            "markeredgecolor": self.colour if self.hollow else "white",
+            "markeredgewidth": 1.0 if self.hollow else 0.4,
+            "zorder": 3.0 - 0.1 * self.size,
+        }
 
 
+DASH_DOT_DOT = (0, (3, 1, 1, 1, 1, 1))
 STYLES = {
-    "hjepa": Style("#0072B2", "o"),
-    "ts-jepa-1": Style("#D55E00", "s", "--"),
-    "ts-jepa-4": Style("#009E73", "^", "-."),
+    "hjepa": Style("#0072B2", "o", size=7.0),
+    "ts-jepa-1": Style("#D55E00", "s", "--", size=2.8),
+    "ts-jepa-4": Style("#009E73", "^", "-.", size=5.0),
     "hold": Style("#CC79A7", "v", ":"),
-    "zero": Style("#E69F00", "D", (0, (3, 1, 1, 1, 1, 1))),
-    "oracle": Style("#000000", "o", "-", hollow=True),
-    "hold-true": Style("#7F7F7F", "v", ":", hollow=True),
-    "zero-true": Style("#7F7F7F", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
+    "zero": Style("#E69F00", "D", DASH_DOT_DOT, size=3.5),
+    "oracle": Style("#000000", "o", "-", hollow=True, size=8.5),
+    "hold-true": Style("#7F7F7F", "v", ":", hollow=True, size=6.5),
+    "zero-true": Style("#7F7F7F", "D", DASH_DOT_DOT, hollow=True, size=6.5),
+    "ts-jepa-2": Style("#56B4E9", "<", "--"),
+    "ts-jepa-3": Style("#56B4E9", ">", "-."),
+    "ts-jepa-5": Style("#56B4E9", "p", ":"),
+    "supervised-2": Style("#882255", "P", "--"),
+    "supervised-4": Style("#882255", "X", "-."),
+    "autoencoder-2": Style("#999933", "h", "--"),
+    "linear": Style("#44AA99", "d", "--"),
+    "state-kf": Style("#332288", "*", "--", size=5.5),
+    "state-48": Style("#332288", "8", "-."),
+    "local": Style("#000000", "s", ":", hollow=True, size=6.5),
 }
-OTHERS = [Style("#56B4E9", marker, "--") for marker in "PX<>phd*"]
+OTHERS = [Style("#7F7F7F", marker, ":") for marker in "<>phd*PX"]
 LONGEST_OF_THREE = 15  # characters of a label, for three columns of a legend
 
 SCHEDULER_STYLES = {
     "round-robin": Style("#7F7F7F", "s", ":", hollow=True),
-    "opportunistic": Style("#E69F00", "D", (0, (3, 1, 1, 1, 1, 1)), hollow=True),
+    "opportunistic": Style("#E69F00", "D", DASH_DOT_DOT, hollow=True),
     "max-aoi": Style("#009E73", "^", "-."),
     "drift-plus-penalty": Style("#CC79A7", "v", "--", hollow=True),
     "whittle": Style("#D55E00", "s", "--"),
@@ -201,13 +230,9 @@ def _draw(axes: Axes, label: str, points: np.ndarray, style: Style) -> None:
     axes.plot(
         snr_db,
         np.where(devices > 0, devices, np.nan),
-        color=style.colour,
-        linestyle=style.line,
-        marker=style.marker,
-        markerfacecolor="none" if style.hollow else style.colour,
         markevery=-(-len(points) // MARKERS),
-        markersize=6.5 if style.hollow else 4,  # a ring stays visible around a filled marker
         label=label,
+        **style.looks(),
     )
     if len(points) > 1:
         axes.fill_between(snr_db, low, high, color=style.colour, alpha=0.18, linewidth=0)
@@ -390,13 +415,9 @@ def _line(
     axes.plot(
         where,
         value,
-        color=style.colour,
-        linestyle=style.line,
-        marker=style.marker,
-        markerfacecolor="none" if style.hollow else style.colour,
         markevery=-(-len(where) // MARKERS),
-        markersize=5.5 if style.hollow else 3.5,
         label=method,
+        **style.looks(0.9),
     )
     axes.fill_between(where, band[:, 0], band[:, 1], color=style.colour, alpha=0.18, linewidth=0)
 

@@ -104,13 +104,16 @@ class Screen:
         print("\n".join(lines), file=self._results, flush=True)
 
     @contextmanager
-    def progress(self, label: str, total: int, unit: str, *, done: int = 0) -> Iterator[Advance]:
+    def progress(
+        self, label: str, total: int, unit: str = "", *, done: int = 0
+    ) -> Iterator[Advance]:
         """Show how far a loop is: a bar on a terminal, otherwise a line every ten seconds.
 
         Args:
             label: what is being done, one word or two.
             total: units of work.
-            unit: their name, for the rate ("traj" → "310 traj/s").
+            unit: their name, for the rate ("traj" → "310 traj/s"); without one, units are nothing
+                that people count, and only the share of them is shown.
             done: units done before, by a run that is continued.
         """
         if self.quiet:
@@ -122,9 +125,11 @@ class Screen:
         else:
             with self._open_bars() as bars:
                 task = bars.add_task(
-                    label, total=total, completed=done, unit=unit, rate="", fields=""
+                    label, total=total, completed=done, count="", rate="", fields=""
                 )
-                yield _Bar(bars, task, unit)
+                bar = _Bar(bars, task, total, unit, done)
+                bar.advance(0)
+                yield bar
                 bars.refresh()
 
     @contextmanager
@@ -135,7 +140,6 @@ class Screen:
             return
         from rich.progress import (
             BarColumn,
-            MofNCompleteColumn,
             Progress,
             TextColumn,
             TimeRemainingColumn,
@@ -144,7 +148,7 @@ class Screen:
         with Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=20),
-            MofNCompleteColumn(),
+            TextColumn("{task.fields[count]}", markup=False),
             TextColumn("{task.fields[rate]}", markup=False),
             TextColumn("{task.fields[fields]}", markup=False),
             TimeRemainingColumn(elapsed_when_finished=True),
@@ -169,20 +173,22 @@ class _Silent:
 class _Bar:
     """One line of the live display."""
 
-    def __init__(self, bars: "RichProgress", task: Any, unit: str) -> None:
-        self._bars, self._task, self._unit = bars, task, unit
-        self._done = 0
+    def __init__(self, bars: "RichProgress", task: Any, total: int, unit: str, done: int) -> None:
+        self._bars, self._task, self._total, self._unit = bars, task, total, unit
+        self._done = self._before = done
         self._fields = ""
         self._started_s = time.monotonic()
 
     def advance(self, count: int = 1, **fields: float) -> None:
         self._done += count
         self._fields = _fields(fields) or self._fields
-        rate = self._done / max(time.monotonic() - self._started_s, 1e-9)
+        rate = (self._done - self._before) / max(time.monotonic() - self._started_s, 1e-9)
+        counted = f"{self._done}/{self._total}"
         self._bars.update(
             self._task,
             advance=count,
-            rate=f"{_significant(rate)} {self._unit}/s",
+            count=counted if self._unit else _percent(self._done, self._total),
+            rate=f"{_significant(rate)} {self._unit}/s" if self._unit else "",
             fields=self._fields,
         )
 
@@ -212,11 +218,11 @@ class _Heartbeat:
 
     def _print(self, when: str) -> None:
         self._printed_s = time.monotonic()
-        percent = 100 * self._done // max(self._total, 1)
-        line = (
-            f"{self._label} {self._done}/{self._total} ({percent} %) "
-            f"{_significant(self._rate())} {self._unit}/s {self._fields} {when}"
-        )
+        done = _percent(self._done, self._total)
+        if self._unit:
+            rate = f"{_significant(self._rate())} {self._unit}/s"
+            done = f"{self._done}/{self._total} ({done}) {rate}"
+        line = f"{self._label} {done} {self._fields} {when}"
         print(" ".join(one_line(line).split()), file=self._stream, flush=True)
 
 
@@ -359,6 +365,10 @@ def _significant(value: float) -> str:
 
 def _fields(fields: Mapping[str, float]) -> str:
     return " ".join(f"{name} {value:.3g}" for name, value in fields.items())
+
+
+def _percent(done: int, total: int) -> str:
+    return f"{100 * done // max(total, 1)} %"
 
 
 def _clock(seconds: float) -> str:

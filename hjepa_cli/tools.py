@@ -232,6 +232,8 @@ def reproduce(
     plant: options.PlantName = None,
     seed: options.Seed = None,
     device: options.Device = None,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     dry_run: options.DryRun = False,
@@ -258,4 +260,6 @@ def reproduce(
         lambda: plan.plan_reproduce(settings, out),
         dry_run=dry_run,
         product="report",
+        workers=workers,
+        cluster=cluster,
     )

@@ -93,6 +93,25 @@ def test_drive_keeps_every_state_and_scores_like_eval():
         hjepa_cli.drive("oracle", gap_steps=3, delivery=0.5)
 
 
+def test_a_simulated_cell_is_the_stage_s():
+    """The law ``scheduled``: without fades, a turn every N slots is a gap of N."""
+    calm = {**QUICK, "radio.power_margin_db": 300.0}
+    cell = hjepa_cli.simulate_cell("hold-true", devices=10, settings=calm)
+    assert cell["score"].shape == cell["cost"].shape == cell["packets"].shape == (10,)
+    assert (cell["packets"] == 4).all() or cell["packets"].sum() == 39
+    turns = hjepa_cli.drive("hold-true", gap_steps=10, devices=10, settings=QUICK)
+    np.testing.assert_array_equal(cell["score"], turns["score"])
+    faded = hjepa_cli.simulate_cell("hold-true", devices=10, blocks=10, settings=QUICK)
+    assert 0.85 < faded["packets"].mean() / 39 < 0.95  # margin of 10 dB: exp(-0.1) = 0.905
+    asked = hjepa_cli.simulate_cell(
+        "hold-true", devices=10, scheduler="innovation", settings=QUICK
+    )
+    assert asked["reports"] > 0 == cell["reports"]
+    for wrong in ({"scheduler": "luck"}, {"blocks": 11}):
+        with pytest.raises(UsageError):
+            hjepa_cli.simulate_cell("hold-true", devices=10, settings=QUICK, **wrong)
+
+
 def test_stages_return_their_documents_and_print_nothing(capsys):
     small = {"collect.trajectories": 2, "collect.test_trajectories": 2, "collect.steps": 10}
     data = hjepa_cli.collect(preset="smoke", settings=small, out="d")

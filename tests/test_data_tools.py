@@ -168,34 +168,6 @@ def test_bad_exports_are_refused_before_anything_is_written(shell):
     assert "render 36 frames" in plan["work"]
 
 
-@pytest.mark.parametrize(
-    ("package", "arguments", "extra"),
-    [
-        ("h5py", ["export", "--format", "hdf5"], "hjepa[hdf5]"),
-        ("PIL", ["preview"], "hjepa[plot]"),
-    ],
-)
-def test_a_missing_extra_names_the_line_that_installs_it(
-    shell, monkeypatch, package, arguments, extra
-):
-    monkeypatch.delitem(sys.modules, "hjepa_cli.pictures", raising=False)
-    monkeypatch.setitem(sys.modules, package, None)
-
-    class Missing:
-        def find_spec(self, name, path=None, target=None):
-            if name.partition(".")[0] == package:
-                raise ModuleNotFoundError(name=package)
-
-    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(sys, "meta_path", [Missing(), *sys.meta_path])
-    import hjepa_cli
-
-    monkeypatch.delattr(hjepa_cli, "pictures", raising=False)
-    with shell.untouched():
-        assert_one_line_error(shell("data", *arguments, "--quiet"), 66, f'pip install "{extra}"')
-
-
 # --- config show
 
 

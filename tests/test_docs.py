@@ -5,6 +5,8 @@ import importlib.machinery
 import importlib.util
 import re
 import shlex
+import subprocess
+import tomllib
 import warnings
 from pathlib import Path
 
@@ -25,6 +27,12 @@ def test_the_reference_of_the_command_line_is_current():
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader("reference", loader))
     loader.exec_module(module)
     assert (ROOT / "docs/cli.md").read_text() == module.reference()
+
+
+SHELL = re.compile(
+    r"^ {4}((?:\.venv/bin/)?(?:hjepa|make|python3?|pip|torchrun|dask) [^\n#]*)", re.MULTILINE
+)
+INSTALL = re.compile(r"pip install (?:-e )?\"(?:hjepa|\.)\[(\w+)\]\"")
 
 
 def text_of(page):
@@ -67,6 +75,49 @@ def test_every_command_of_the_documentation_is_understood(
     assert outcome.code in allowed, (page, outcome)
 
 
+def other_lines():
+    """What command blocks and running text hold beside `hjepa …`, by page."""
+    for page in PAGES:
+        if page not in ("docs/cli.md", "docs/LOG.md"):
+            text = text_of(page)
+            lines = SHELL.findall(text) + re.findall(r"`((?:make|python|torchrun) [^`\n]+)`", text)
+            for line in dict.fromkeys(line.strip() for line in lines):
+                if not line.removeprefix(".venv/bin/").startswith("hjepa "):
+                    yield line, page
+
+
+@pytest.mark.parametrize(("line", "page"), list(other_lines()), ids=str)
+def test_every_other_command_of_the_documentation_names_what_is_there(
+    tmp_path, monkeypatch, capsys, line, page
+):
+    """Targets of make, scripts, extras, pytest; what torchrun starts is planned."""
+    if line.startswith("make "):
+        arguments = [word for word in shlex.split(line)[1:] if word != "..."]
+        done = subprocess.run(
+            ["make", "--dry-run", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    elif line.startswith("torchrun "):
+        _, _, of_hjepa = line.partition(" -m hjepa_cli ")
+        outcome = open_shell(tmp_path, monkeypatch, capsys)(*shlex.split(of_hjepa), "--dry-run")
+        assert outcome.code in (0, 66), outcome  # a run of the reader's
+    elif "pip install" in line:
+        assert INSTALL.search(line), line
+    elif match := re.fullmatch(r"python (benchmarks/\w+\.py).*", line):
+        assert (ROOT / match[1]).is_file()
+    else:
+        assert line in ("python3 -m venv .venv", ".venv/bin/python -m pytest"), (line, page)
+
+
+def test_every_extra_that_is_named_exists():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    sources = [ROOT / page for page in PAGES] + sorted(ROOT.glob("hjepa_cli/**/*.py"))
+    named = {extra for path in sources for extra in INSTALL.findall(path.read_text())}
+    assert {"plot", "video", "hdf5", "gym", "track", "cluster"} <= named <= set(extras)
+
+
 def blocks():
     """Python blocks by page; ``>>>`` sessions of a page are one, other blocks stand alone."""
     for page in PAGES:
@@ -100,5 +151,19 @@ def test_every_python_block_runs(tmp_path, monkeypatch, page, code):
 
 def test_links_between_pages_lead_somewhere():
     for page in PAGES:
-        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", (ROOT / page).read_text()):
-            assert (Path(ROOT / page).parent / target).exists(), (page, target)
+        text = (ROOT / page).read_text()
+        targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text)
+        targets += re.findall(r"src=\"([^\":]+)\"", text)
+        for target in targets:
+            assert (ROOT / page).parent.joinpath(target).exists(), (page, target)
+
+
+def test_links_into_a_page_lead_to_a_heading():
+    for page in PAGES:
+        for target, place in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", (ROOT / page).read_text()):
+            lines = (
+                (ROOT / page).parent.joinpath(target or Path(page).name).read_text().splitlines()
+            )
+            headings = [line.lstrip("# ").lower() for line in lines if line.startswith("#")]
+            anchors = [re.sub(r"[^\w\- ]", "", text).replace(" ", "-") for text in headings]
+            assert place in anchors, (page, target, place)

@@ -99,6 +99,21 @@ def test_methods_differ_without_colour():
     ) == len(METHODS)
 
 
+def test_every_look_is_one_method_s_also_without_colour():
+    looks = {(style.marker, style.hollow) for style in figures.STYLES.values()}
+    assert len(looks) == len(figures.STYLES)
+
+
+def test_curves_on_top_of_each_other_all_stay_visible():
+    """Each is drawn over those with larger markers, and the largest has the solid line."""
+    drawn = lines(figures.devices_figure(rows(("hjepa", "ts-jepa-1", "ts-jepa-4"))))
+    above = sorted(drawn, key=lambda name: drawn[name].get_zorder())
+    assert above == ["hjepa", "ts-jepa-4", "ts-jepa-1"]
+    sizes = [drawn[name].get_markersize() for name in above]
+    assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) == 3
+    assert drawn["hjepa"].get_linestyle() == "-" != drawn["ts-jepa-1"].get_linestyle()
+
+
 def test_methods_differ_by_name_not_by_order():
     """A method keeps its look whatever else is in the figure."""
     alone, all_of_them = (

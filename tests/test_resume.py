@@ -444,6 +444,29 @@ def hjepa(
     return open_shell(tmp_path, monkeypatch, capsys)
 
 
+STAGES = ("train-encoder", "train-hierarchy", "eval", "scale", "reproduce")
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_dry_run_says_what_is_taken_up_and_takes_up_nothing(hjepa: Shell, stage: str) -> None:
+    settings = load_settings("smoke", flags={"seed": 3})
+    inputs = {"dataset": None, "checkpoint": None, "remeasure": False}
+    with runs.Run.create(stage, Path("r"), settings.as_dict(), inputs):
+        pass
+    with hjepa.untouched():
+        plan = hjepa("resume", "r", "--dry-run", "--json").document["plan"]
+    flags = () if stage == "reproduce" else ("--out", "r")
+    again = hjepa(stage, "--preset", "smoke", "--dry-run", "--json", *flags).document["plan"]
+    assert plan["work"] == [
+        "go on where it was interrupted; from the start it would",
+        *again["work"],
+    ]
+    assert plan["command"] == "resume r" and plan["seconds"] == again["seconds"]
+    with runs.Run.create(stage, Path("r"), settings.as_dict(), inputs) as record:
+        record.finish({})
+    assert "r, which is finished" in hjepa("resume", "r", "--dry-run").out
+
+
 def test_what_cannot_be_resumed(hjepa: Shell) -> None:
     assert_one_line_error(hjepa("resume", "gone"), 66, "run gone does not exist")
     (hjepa.directory / "empty").mkdir()
@@ -461,6 +484,23 @@ def test_what_cannot_be_resumed(hjepa: Shell) -> None:
     ):
         (run / "environment.json").write_text(text)
         assert_one_line_error(hjepa("resume", "run"), code, message)
+
+
+def test_a_run_of_another_version_says_so(hjepa: Shell) -> None:
+    """Settings that this version lacks: what to do; the same settings: a note, and it goes on."""
+    assert hjepa("eval", "--preset", "smoke", "--methods", "hold-true", "--out", "r").code == 0
+    Path("r/result.json").unlink()
+    environment = json.loads(Path("r/environment.json").read_text())
+    environment["versions"]["hjepa"] = "9.8.7"
+    Path("r/environment.json").write_text(json.dumps(environment))
+    known = Path("r/config.toml").read_text()
+    Path("r/config.toml").write_text(known + "\n[quantum]\nleap = 1\n")
+    with hjepa.untouched():
+        outcome = hjepa("resume", "r")
+    assert_one_line_error(outcome, 2, "made by hjepa 9.8.7", "quantum", "hjepa eval --out DIR")
+    Path("r/config.toml").write_text(known)
+    outcome = hjepa("resume", "r")
+    assert outcome.code == 0 and "begun by hjepa 9.8.7" in outcome.err
 
 
 def test_a_batch_system_ends_a_run_the_same_way(

@@ -182,6 +182,17 @@ def test_heartbeat_rate_of_a_continued_run_counts_only_what_this_process_did(str
     assert first == "train 95/100 (95 %) 0.500 steps/s eta 0:00:10"
 
 
+def test_units_that_nobody_counts_are_shown_as_a_share(streams, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(screen_module.time, "monotonic", lambda: now[0])
+    with screen_on(streams).progress("all stages", 467) as p:
+        now[0] = 190.0
+        p.advance(190)
+        p.advance(277)
+    lines = streams[1].getvalue().splitlines()
+    assert lines == ["all stages 40 % eta 0:04:37", "all stages 100 % in 0:03:10"]
+
+
 def test_a_failing_loop_prints_no_final_heartbeat(streams):
     with pytest.raises(RuntimeError), screen_on(streams).progress("p", 10, "x") as p:
         p.advance()
@@ -200,12 +211,15 @@ def test_bar_on_a_terminal_shows_label_count_rate_loss_and_eta(monkeypatch):
         time.sleep(0.15)
         with screen.progress("inner", 3, "frames") as q:  # a nested bar is one more line
             q.advance(3)
+        with screen.progress("share", 3) as q:
+            q.advance(1)
         screen.say("a [/note]")
         p.advance(2, loss=0.125)
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stderr.getvalue())
     assert "train [/x]" in text and "4/4" in text and "loss 0.125" in text
     assert re.search(r"\d steps/s", text) and re.search(r"\d:\d\d:\d\d", text)
     assert "inner" in text and "3/3" in text and "a [/note]\n" in text
+    assert "33 %" in text and "1/3" not in text
 
 
 def test_forced_colours_do_not_turn_a_file_into_a_terminal(streams, monkeypatch):

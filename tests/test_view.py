@@ -2,7 +2,6 @@
 
 import io
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from hjepa_cli.settings import load_settings
 from hjepa_cli.stages.view import Believer, Film, Link, make_link
 
 image_module = pytest.importorskip("PIL.Image")
-from hjepa_cli import animation  # noqa: E402 - needs Pillow
+from hjepa_cli import animation, live  # noqa: E402 - needs Pillow
 
 SMALL = """
 [collect]
@@ -183,14 +182,41 @@ def test_the_belief_is_drawn_where_it_is():
         assert (hits > 15) == is_there
 
 
-def test_terminal_pictures_are_text_for_every_device():
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 30), (40, 24), (200, 60)])
+def test_terminal_pictures_fit_the_terminal(width, height):
+    shots = pictures()
+    lines = rendered(shots, 50, width, height)
+    assert max(map(len, lines)) <= width and len(lines) <= height - 1
+    text = "\n".join(lines)
+    assert text.count("ms old") == 2 and "▀" in text and "hjepa, 50 ms" in text
+    assert text.count("theta off by +11.5°") == 2
+
+
+def rendered(shots, k, width, height):
+    """A picture of the terminal as lines without colours."""
     from rich.console import Console
 
-    shots = pictures()
-    console = Console(file=io.StringIO(), width=100, color_system="truecolor", force_terminal=True)
-    console.print(animation.terminal_picture(shots, 50))
-    text = console.file.getvalue()
-    assert text.count("ms old") == 2 and "▀" in text and "hjepa, 50 ms" in text
+    console = Console(file=io.StringIO(), width=width, height=height, color_system=None)
+    console.print(live.terminal_picture(shots, k, width, height))
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+def test_the_terminal_marks_what_arrived_and_what_was_lost():
+    """A character per picture, the newest at the right."""
+    shots = pictures(steps=300, devices=1, every=10)
+    (strip,) = (line for line in rendered(shots, 290, 80, 24) if line.strip("█· ") == "")
+    slots = shots.link.delivered[1:291, 0].reshape(29, 10).any(axis=1)
+    assert strip.lstrip()[1:] == "".join("█" if arrived else "·" for arrived in slots)
+
+
+def test_the_terminal_shows_where_the_controller_believes_the_pole_to_be():
+    shots = pictures(devices=1)
+    scene = live._scene(shots, shots.films[0], 0, 0, 64)
+    black = {span.start for span in scene.spans if "#000000" in str(span.style)}
+    columns = [start % 65 for start in black]  # a line is 64 characters and its end
+    pivot = 32 + 0.02 * 64 / 0.6
+    tip = pivot + np.sin(0.3) * 0.2 * 64 / 0.6  # believed at 0.3 rad, true at 0.1
+    assert min(columns) == pytest.approx(pivot, abs=1) and max(columns) == pytest.approx(tip, abs=1)
 
 
 # --- the command
@@ -243,7 +269,7 @@ def test_dry_run_says_what_would_be_drawn(shell, checkpoint):
     assert outcome.code == 0 and "5 devices" in outcome.out and "hjepa-view.gif" in outcome.out
 
 
-def test_what_cannot_be_viewed_is_refused(shell, checkpoint, monkeypatch):
+def test_what_cannot_be_viewed_is_refused(shell, checkpoint):
     small = ["--checkpoint", checkpoint, "--config", "small.toml", "--quiet"]
     with shell.untouched():
         assert_one_line_error(shell("view", "--methods", "oracle", *small), 2, "oracle", "hjepa")
@@ -251,5 +277,3 @@ def test_what_cannot_be_viewed_is_refused(shell, checkpoint, monkeypatch):
         assert_one_line_error(shell("view", "--live", *small), 2, "terminal")
         assert_one_line_error(shell("view", "--delivery", "0", *small), 2, "--delivery")
         assert_one_line_error(shell("view", "--snr", "nan", *small), 2, "--snr")
-        monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-        assert_one_line_error(shell("view", "--out", "a.mp4", *small), 66, "hjepa[video]")

@@ -140,7 +140,7 @@ def make_shards(
     left = [shard for shard in shards if shard.name not in log.done]
     done = sum(sizes.values()) - sum(shard.stop - shard.start for shard in left)
     screen.say(
-        f"collecting {settings.plant} trajectories into {directory.name}: "
+        f"collecting {settings.plant} trajectories into {directory}: "
         f"{len(left)} of {len(shards)} shards"
     )
     make = functools.partial(make_shard, settings, directory)

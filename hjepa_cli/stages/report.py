@@ -74,8 +74,7 @@ def found_runs(paths: Sequence[Path]) -> list[Path]:
         if not below:
             if (path / runs.CONFIG).is_file():
                 raise MissingInputError(
-                    f"{path} is an unfinished run",
-                    hint="repeat its command with --out and this directory",
+                    f"{path} is an unfinished run", hint=f"hjepa resume {shlex.quote(str(path))}"
                 )
             raise MissingInputError(f"no finished run in {path}", hint="hjepa eval, hjepa scale")
         found += below
@@ -101,9 +100,9 @@ def describe(directory: Path, screen: Screen) -> tuple[list[str], Figures]:
     """One run as a section of HTML, and its figures."""
     stage = stage_of(directory)
     result, config = runs.read_result(directory), runs.read_config(directory)
-    environment = files.read_json(directory / runs.ENVIRONMENT)
+    environment = runs.read_environment(directory)
     parts = [html.heading(2, f"{stage}: {directory}")]
-    made_by = environment.get("versions", {}).get("hjepa")
+    made_by = runs.version_of(environment)
     if made_by != __version__:
         again = f"hjepa {stage} --config {directory / runs.CONFIG}"
         parts.append(
@@ -141,10 +140,7 @@ def describe(directory: Path, screen: Screen) -> tuple[list[str], Figures]:
 
 def stage_of(directory: Path) -> str:
     """Which command made a run. Raises DataError where it does not say."""
-    stage = files.read_json(directory / runs.ENVIRONMENT).get("stage")
-    if not isinstance(stage, str):
-        raise DataError(f"{directory / runs.ENVIRONMENT} names no stage")
-    return stage
+    return str(runs.read_environment(directory)["stage"])
 
 
 def draw(figures_of: Callable[[], Figures], screen: Screen) -> Figures:

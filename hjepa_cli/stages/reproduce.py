@@ -41,7 +41,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
         parts = plan.reproduce_parts(settings)
         expected_s = {name: round(seconds) for name, (_, seconds) in parts.items()}
         results: Result = {}
-        with screen.progress("reproduce", sum(expected_s.values()), "planned s") as bar:
+        with screen.progress("all stages", sum(expected_s.values())) as bar:
             for number, (name, stage) in enumerate(work.items(), start=1):
                 screen.say(f"stage {number} of {len(work)}: {name}")
                 results[name] = stage()

@@ -3,17 +3,20 @@
 The run remembers its settings (``config.toml``) and what it was given (``environment.json``).
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli import torchrun
+from hjepa_cli import __version__, plan, torchrun
 from hjepa_cli.checks import check_settings
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import load_settings
+from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.storage.datasets import MANIFEST, load_dataset
-from hjepa_cli.storage.runs import CONFIG, read_environment
+from hjepa_cli.storage.runs import CONFIG, RESULT, read_environment, version_of
 from hjepa_cli.storage.shards import LOG, read_task
+
+STAGES = ("train-encoder", "train-hierarchy", "eval", "scale", "reproduce")
 
 
 def run(directory: Path, screen: Screen) -> dict[str, Any]:
@@ -27,18 +30,20 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
         DataError: its records are damaged.
         As the stage.
     """
-    if not directory.is_dir():
-        raise MissingInputError(f"run {directory} does not exist", hint="ls runs/*")
-    if (directory / LOG).exists() or (directory / MANIFEST).exists():
+    if (directory / MANIFEST).exists():
+        from hjepa_cli.stages import collect
+
         torchrun.refuse()
-        return _collect(directory, screen)
-    recorded = read_environment(directory)
-    stage, inputs = recorded["stage"], recorded["inputs"]
+        screen.say(f"{directory} holds a finished dataset")
+        return collect.describe(load_dataset(directory), 0.0, None)
+    stage, settings, inputs = recall(directory, screen)
     if stage != "train-encoder":
         torchrun.refuse()
-    settings = load_settings(_preset(recorded, directory), directory / CONFIG)
-    check_settings(settings)
     dataset = _path(inputs, "dataset")
+    if stage == "collect":
+        from hjepa_cli.stages import collect
+
+        return collect.run(settings, screen, out=directory)
     if stage == "train-encoder":
         from hjepa_cli.stages import train_encoder
 
@@ -74,26 +79,82 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
             remeasure=remeasure,
             verify=bool(inputs.get("verify")),
         )
-    if stage == "reproduce":
-        from hjepa_cli.stages import reproduce
+    from hjepa_cli.stages import reproduce
 
-        return reproduce.run(settings, screen, out=directory)
-    raise DataError(f"{directory} holds a run of '{stage}', which this hjepa does not know")
+    return reproduce.run(settings, screen, out=directory)
 
 
-def _collect(directory: Path, screen: Screen) -> dict[str, Any]:
-    from hjepa_cli.stages import collect
+def planned(directory: Path) -> plan.Plan:
+    """Plan of ``hjepa resume``: of the command that it repeats, which skips what is there already.
 
-    if (directory / MANIFEST).exists():
-        screen.say(f"{directory} holds a finished dataset")
-        return collect.describe(load_dataset(directory), 0.0, None)
-    task = read_task(directory)
-    flags = {key: value for key, value in task.items() if key != "preset"}
-    for section in [key for key, value in flags.items() if isinstance(value, dict)]:
-        flags |= {f"{section}.{key}": value for key, value in flags.pop(section).items()}
-    settings = load_settings(_preset(task, directory), None, flags)
-    check_settings(settings)
-    return collect.run(settings, screen, out=directory)
+    Raises:
+        MissingInputError: no such run, or an input of it is gone.
+        DataError: its records are damaged.
+    """
+    if any((directory / name).exists() for name in (MANIFEST, RESULT)):
+        return plan.Plan(f"resume {directory}", [f"{directory}, which is finished"], [], [], 0, 0.0)
+    stage, settings, inputs = recall(directory, Screen(quiet=True))
+    dataset = _path(inputs, "dataset")
+    checkpoint, encoder = _text(_path(inputs, "checkpoint")), _text(_path(inputs, "encoder"))
+    remeasure, verify = bool(inputs.get("remeasure")), bool(inputs.get("verify"))
+    if stage == "collect":
+        whole = plan.plan_collect(settings, directory)
+    elif stage == "train-encoder":
+        whole = plan.plan_train_encoder(settings, dataset, directory)
+    elif stage == "train-hierarchy":
+        whole = plan.plan_train_hierarchy(settings, dataset, encoder, directory)
+    elif stage == "eval":
+        whole = plan.plan_eval(settings, checkpoint, dataset, directory, remeasure=remeasure)
+    elif stage == "scale":
+        from hjepa_cli.core.capacity import parse_snr
+
+        grid_db = parse_snr(settings.radio.snr_db)
+        whole = plan.plan_scale(
+            settings, checkpoint, dataset, directory, grid_db, remeasure=remeasure, verify=verify
+        )
+    else:
+        whole = plan.plan_reproduce(settings, directory)
+    work = ["go on where it was interrupted; from the start it would", *whole.work]
+    return dataclasses.replace(whole, command=f"resume {directory}", work=work)
+
+
+def recall(directory: Path, screen: Screen) -> tuple[str, Settings, dict[str, Any]]:
+    """The stage, the settings and the inputs of an unfinished run.
+
+    Raises:
+        MissingInputError: no such run.
+        UsageError: its settings are not those of this version.
+        DataError: its records are damaged, or of a stage that this version does not know.
+    """
+    if not directory.is_dir():
+        raise MissingInputError(f"run {directory} does not exist", hint="ls runs/*")
+    if (directory / LOG).exists():
+        task = read_task(directory)
+        flags = {key: value for key, value in task.items() if key != "preset"}
+        for section in [key for key, value in flags.items() if isinstance(value, dict)]:
+            flags |= {f"{section}.{key}": value for key, value in flags.pop(section).items()}
+        settings = load_settings(_preset(task, directory), None, flags)
+        check_settings(settings)
+        return "collect", settings, {}
+    found = read_environment(directory)
+    if found["stage"] not in STAGES:
+        raise DataError(
+            f"{directory} holds a run of '{found['stage']}', which this hjepa does not know"
+        )
+    made_by = version_of(found) or __version__
+    try:
+        settings = load_settings(_preset(found, directory), directory / CONFIG)
+        check_settings(settings)
+    except UsageError as error:
+        if made_by == __version__:
+            raise
+        raise UsageError(
+            f"{directory} was made by hjepa {made_by}, this is {__version__}: {error.message}",
+            hint=f"take it up with hjepa {made_by}; or anew: hjepa {found['stage']} --out DIR",
+        ) from None
+    if made_by != __version__:
+        screen.say(f"begun by hjepa {made_by}, this is {__version__}: results may differ")
+    return found["stage"], settings, found["inputs"]
 
 
 def _preset(recorded: dict[str, Any], directory: Path) -> str | None:

@@ -137,6 +137,7 @@ def run(
     """
     try:
         from hjepa_cli import animation
+        from hjepa_cli import live as terminal
     except ModuleNotFoundError as missing:
         if missing.name != "PIL":
             raise
@@ -173,7 +174,7 @@ def run(
         "file": None if live else out,
     }
     if live:
-        animation.play(pictures, fps)
+        terminal.play(pictures, fps)
         return result
     with screen.progress("draw", len(pictures), "pictures") as bar:
         animation.write(pictures, out, fps, bar.advance)

@@ -260,6 +260,12 @@ def read_environment(directory: Path) -> dict[str, Any]:
     return recorded
 
 
+def version_of(recorded: Mapping[str, Any]) -> str | None:
+    """The version of this program that made a run, of what :func:`read_environment` returns."""
+    versions = recorded.get("versions")
+    return versions.get("hjepa") if isinstance(versions, dict) else None
+
+
 def describe_input(path: Path, digest: str) -> dict[str, str]:
     """How a run remembers a file or directory that it reads: where it was and what it was."""
     return {"path": str(path.absolute()), "sha256": digest}
