@@ -103,9 +103,7 @@ def test_a_simulated_cell_is_the_stage_s():
     np.testing.assert_array_equal(cell["score"], turns["score"])
     faded = hjepa_cli.simulate_cell("hold-true", devices=10, blocks=10, settings=QUICK)
     assert 0.85 < faded["packets"].mean() / 39 < 0.95  # margin of 10 dB: exp(-0.1) = 0.905
-    asked = hjepa_cli.simulate_cell(
-        "hold-true", devices=10, scheduler="innovation", settings=QUICK
-    )
+    asked = hjepa_cli.simulate_cell("hold-true", devices=10, scheduler="innovation", settings=QUICK)
     assert asked["reports"] > 0 == cell["reports"]
     for wrong in ({"scheduler": "luck"}, {"blocks": 11}):
         with pytest.raises(UsageError):
