@@ -26,8 +26,10 @@ th, td { padding: 0.2rem 0.45rem; border-bottom: 1px solid #ddd; text-align: rig
          white-space: nowrap; }
 th.text, td.text, th:first-child, td:first-child { text-align: left; }
 td.text:not(:first-child) { white-space: normal; }
-pre, code { background: #f5f5f5; font-size: 0.85rem; } pre { padding: 0.6rem; overflow-x: auto; }
-figure { margin: 1rem 0; display: inline-block; vertical-align: top; max-width: 27rem; }
+pre, code { background: #f5f5f5; font-size: 0.85rem; } pre { padding: 0.6rem;
+      white-space: pre-wrap; overflow-wrap: anywhere; }
+figure { margin: 1rem 0; display: inline-block; vertical-align: top; width: 27rem;
+         max-width: 100%; }
 figure img { width: 100%; } figcaption { color: #555; font-size: 0.9rem; }
 .note { background: #fff3cd; padding: 0.4rem 0.8rem; }
 @media print { details[open] { display: block; } }

@@ -109,7 +109,12 @@ def scaled():
 
 
 def trained():
-    gates = {"effective_rank": {"value": 3.0, "threshold": 4.0, "passed": False}}
+    gates = {
+        "effective_rank": {"value": 3.0, "threshold": 4.0, "passed": False},
+        "probe_r2_theta": {"value": 0.9, "threshold": 0.8, "passed": True},
+        "probe_r2_x": {"value": 0.97, "threshold": 0.95, "passed": True},
+        "actor_nrmse": {"value": 0.2, "threshold": 0.35, "passed": True},
+    }
     rows = [
         {"step": step, "loss_prediction": 1 / step, "probe_r2_x": 0.5, "probe_r2_theta": None}
         for step in (1, 2, 3)
@@ -149,12 +154,67 @@ def test_a_report_shows_numbers_intervals_settings_and_commands(shell, without_f
     shell("report")
     said = " ".join(Reader(Path("report.html").read_text()).texts)
     for text in (
-        *("1110 (1110 – 1117)", "≥ 500 (500 – 507)", "12,346", "+122.0 % devices"),
+        *("1110 (1110 – 1117)", "≥ 500 (500 – 507)", "12,346"),
+        "+122.0 % (+100.0 % to unbounded) devices",
+        "hjepa eval --config runs/eval/0001/config.toml",
+        *("effective_rank 3 ≥ 4 FAILED", "actor_nrmse 0.2 ≤ 0.35 passed"),
         *("0.950 (0.850 – 1.050)", "81.2 (75.0 – 90.5)", "≤ 0.0125 (0.0100 – 0.0200)"),
         *("256 devices", "effective_rank", "FAILED", "[protocol]", "version of torch"),
         "hjepa scale --config runs/scale/0001/config.toml",
     ):
         assert text in said, text
+
+
+def test_rows_are_in_the_order_of_the_settings_and_the_states(shell, without_figures):
+    """Not in that of the alphabet, in which results are stored."""
+    methods = {name: entry(0.9) for name in ("oracle", "hold", "hjepa")}
+    finished("eval", {"plant": "desktop", "seed": 0, "checkpoint": "m", "methods": methods})
+    trained()
+    shell("report")
+    first = [row[0] for row in rows_of(Path("report.html").read_text())]
+    methods_at = [first.index(name) for name in ("hjepa", "hold", "oracle")]
+    assert methods_at == sorted(methods_at)
+    gates_at = [first.index(name) for name in ("probe_r2_x", "probe_r2_theta", "effective_rank")]
+    assert gates_at == sorted(gates_at)
+
+
+def test_strides_are_told_from_the_highest_level_on(shell, without_figures):
+    strides = {"l": 1, "m": 2, "h": 8}
+    finished("train-hierarchy", {"checkpoint": "c", "seconds": 1, "strides": strides,
+             "nmae_windows": {}})  # fmt: skip
+    shell("report")
+    assert "strides 8/2/1" in Path("report.html").read_text()
+
+
+def test_the_commands_name_what_the_run_was_given(shell, without_figures):
+    given = {
+        name: {"path": str(Path(path).absolute()), "sha256": "0"}
+        for name, path in (("dataset", "data/d"), ("encoder", "e/model.safetensors"))
+    }
+    settings = load_settings().as_dict()
+    with Run.create("train-hierarchy", None, settings, given | {"remeasure": False}) as record:
+        record.finish({"checkpoint": "c", "seconds": 1, "strides": dict.fromkeys("hml", 1),
+                       "nmae_windows": {}})  # fmt: skip
+    shell("report")
+    command = "config.toml --dataset data/d --encoder e/model.safetensors"
+    assert command in Path("report.html").read_text()
+
+
+def test_a_smoke_run_is_called_one(shell, without_figures):
+    trained()
+    shell("report")
+    assert "mean nothing" not in Path("report.html").read_text()
+    with Run.create("train-encoder", None, load_settings("smoke").as_dict()) as record:
+        record.finish({"checkpoint": "c", "seconds": 1.0, "gates": {}})
+    shell("report")
+    assert "mean nothing" in Path("report.html").read_text()
+
+
+def rows_of(text):
+    """The texts of every table's rows."""
+    found = re.findall(r"<tr>(.*?)</tr>", text)
+    return [[*map(re.compile(r"<[^>]*>").sub, [""] * 99, re.findall(r"<t[dh].*?</t[dh]>", row))]
+            for row in found]  # fmt: skip
 
 
 def test_names_cannot_smuggle_markup_in(shell, without_figures):
@@ -190,8 +250,9 @@ def test_equal_runs_give_equal_reports(shell):
 
 
 def test_figures_are_written_in_the_formats_asked_for(shell):
-    finished("train-hierarchy", {"checkpoint": "c", "seconds": 1, "strides": {"h": 4},
-             "nmae_windows": {}}, [{"level": "high", "step": 1, "loss": 0.5}])  # fmt: skip
+    finished("train-hierarchy", {"checkpoint": "c", "seconds": 1,
+             "strides": dict.fromkeys("hml", 1), "nmae_windows": {}},
+             [{"level": "high", "step": step, "loss": 0.5} for step in (1, 2)])  # fmt: skip
     arguments = ["report", "runs/train-hierarchy/0001", "--figures", "f", "--format", "pdf,png"]
     document = shell(*arguments, "--json").document
     names = {f"f/train-hierarchy-training.{kind}" for kind in ("pdf", "png")}

@@ -99,9 +99,9 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     result = describe(data, time.perf_counter() - started, frames_per_s)
     bits = raw_frame_bits(FRAMES_PER_SAMPLE, HEIGHT_PX, WIDTH_PX)
     screen.say(
-        f"{result['trajectories']} training trajectories in {result['seconds']:.1f} s; as raw "
-        f"frames the training phase takes {result['training_uplink_bits'] / 1e9:.3g} Gbit of "
-        f"uplink ({bits} bits a step)"
+        f"{result['trajectories']} training trajectories in {result['seconds']:.1f} s: "
+        f"{result['dataset']}; as raw frames the training phase takes "
+        f"{result['training_uplink_bits'] / 1e9:.3g} Gbit of uplink ({bits} bits a step)"
     )
     return result
 
@@ -140,8 +140,7 @@ def make_shards(
     left = [shard for shard in shards if shard.name not in log.done]
     done = sum(sizes.values()) - sum(shard.stop - shard.start for shard in left)
     screen.say(
-        f"collecting {settings.plant} trajectories into {directory}: "
-        f"{len(left)} of {len(shards)} shards"
+        f"collecting trajectories of plant {settings.plant}: {len(left)} of {len(shards)} shards"
     )
     make = functools.partial(make_shard, settings, directory)
     enough = sum(count * steps for count, steps in split_sizes(settings).values()) >= WORTH_WORKERS

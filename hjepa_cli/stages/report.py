@@ -23,6 +23,8 @@ Figures = dict[str, tuple[str, Any]]
 
 STAGES = ("train-encoder", "train-hierarchy", "eval", "scale")
 FIGURE_FORMATS = ("pdf", "svg", "png")
+SMOKE = "smoke"
+NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
 
 
 def run(
@@ -47,8 +49,10 @@ def run(
         DataError: a damaged run.
     """
     directories = found_runs(paths)
-    parts = [html.heading(1, "hjepa report"), html.paragraph(f"hjepa {__version__}")]
+    parts = [html.heading(1, "hjepa report"), html.paragraph(f"Written by hjepa {__version__}.")]
     parts.append(contents(directories))
+    if any(runs.read_environment(directory)["preset"] == SMOKE for directory in directories):
+        parts.append(html.paragraph(f"{NO_RESULT}.", note=True))
     written: list[Path] = []
     for directory in directories:
         section, drawn = describe(directory, screen)
@@ -57,8 +61,9 @@ def run(
             written += write_figures(drawn, figures, stage_of(directory), formats)
     files.make_directory(out.parent)
     files.write_text(out, html.page("hjepa report", parts))
-    for path in (out, *written):
-        screen.say(f"written: {path}")
+    if figures is not None:
+        screen.say(f"{len(written)} figures in {figures}")
+    screen.say(f"written: {out}")
     return {"report": out, "runs": directories, "figures": written}
 
 
@@ -114,7 +119,7 @@ def describe(directory: Path, screen: Screen) -> tuple[list[str], Figures]:
         )
     section, figures_of = SECTIONS[stage]
     try:
-        parts += section(result)
+        parts += section(result, config)
     except (KeyError, TypeError, IndexError, AttributeError) as error:
         raise DataError(
             f"{directory / runs.RESULT} lacks what a {stage} run has: {error}",
@@ -124,11 +129,9 @@ def describe(directory: Path, screen: Screen) -> tuple[list[str], Figures]:
     parts += [html.picture(svg(figure), "svg+xml", caption) for caption, figure in drawn.values()]
     parts.append(html.heading(3, "Made by"))
     command = ["hjepa", *map(str, environment.get("command", [])[1:])]
-    again = ["hjepa", stage, "--config", str(directory / runs.CONFIG)]
-    if stage in ("eval", "scale") and result.get("checkpoint"):
-        again += ["--checkpoint", str(result["checkpoint"])]
+    again = ["hjepa", stage, "--config", str(directory / runs.CONFIG), *inputs_of(environment)]
     text = "# as it was typed\n" + shlex.join(command)
-    text += "\n# the same settings again\n" + shlex.join(again)
+    text += "\n# this stage again, with the same settings and inputs\n" + shlex.join(again)
     parts.append(html.code(text))
     versions = {f"version of {name}": v for name, v in environment.get("versions", {}).items()}
     machine = {key: environment.get(key) for key in ("system", "machine", "cpus")}
@@ -136,6 +139,17 @@ def describe(directory: Path, screen: Screen) -> tuple[list[str], Figures]:
     toml = files.read_bytes(directory / runs.CONFIG, limit=files.JSON_LIMIT_BYTES).decode()
     parts.append(html.details("Settings", html.code(toml)))
     return parts, drawn
+
+
+def inputs_of(environment: Mapping[str, Any]) -> list[str]:
+    """What a run was given, as flags; paths below this directory without it."""
+    flags = []
+    for name, given in environment["inputs"].items():
+        if isinstance(given, dict) and isinstance(given.get("path"), str):
+            path = Path(given["path"])
+            here = path.is_relative_to(Path.cwd())
+            flags += [f"--{name}", str(path.relative_to(Path.cwd()) if here else path)]
+    return flags
 
 
 def stage_of(directory: Path) -> str:
@@ -180,11 +194,17 @@ def write_figures(
 # --- one section per stage
 
 
-def encoder_section(result: Mapping[str, Any]) -> list[str]:
+def encoder_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
     """Health and gates."""
+    states = [f"probe_r2_{name}" for name in plant(config["plant"]).state_names]
     rows = [
-        [name, gate["value"], gate["threshold"], "passed" if gate["passed"] else "FAILED"]
-        for name, gate in result["gates"].items()
+        [
+            name,
+            gate["value"],
+            f"{'≤' if name == 'actor_nrmse' else '≥'} {gate['threshold']:g}",
+            "passed" if gate["passed"] else "FAILED",
+        ]
+        for name, gate in in_order(result["gates"], states)
     ]
     return [
         html.paragraph(f"Encoder {result['checkpoint']}, trained in {result['seconds']:.0f} s."),
@@ -192,9 +212,9 @@ def encoder_section(result: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def hierarchy_section(result: Mapping[str, Any]) -> list[str]:
+def hierarchy_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
     """Strides and prediction error."""
-    strides = "/".join(str(stride) for stride in result["strides"].values())
+    strides = "/".join(str(result["strides"][level]) for level in "hml")
     return [
         html.paragraph(
             f"Hierarchy of strides {strides}, {result['checkpoint']}, trained in "
@@ -207,38 +227,51 @@ def hierarchy_section(result: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def eval_section(result: Mapping[str, Any]) -> list[str]:
+def eval_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
     """Scores and tolerances with their intervals."""
-    rows = []
-    for name, entry in result["methods"].items():
-        rows.append(
-            [
-                name,
-                *(float(error) for error in entry["nmae_windows"].values()),
-                span(entry["score"], entry["score_ci95"], 3),
-                float(entry["lq_ratio"]),
-                entry["bits_per_transmission"],
-                tolerance(entry, "gap_steps", "gap", 1, "≥"),
-                tolerance(entry, "p", "p", 4, "≤"),
-            ]
-        )
-    first = next(iter(result["methods"].values()), None)
-    if first is None:
+    entries = in_order(result["methods"], config["methods"])
+    if not entries:
         return [html.paragraph("No method was measured.")]
-    windows = [f"NMAE {window}" for window in first["nmae_windows"]]
-    columns = ["method", *windows, "score", "LQ ratio", "bits", "gap D* [steps]", "delivery p*"]
+    first = entries[0][1]
+    tolerances = [
+        [
+            name,
+            span(entry["score"], entry["score_ci95"], 3),
+            f"{entry['lq_ratio']:.3f}",
+            entry["bits_per_transmission"],
+            tolerance(entry, "gap_steps", "gap", 1, "≥"),
+            tolerance(entry, "p", "p", 4, "≤"),
+        ]
+        for name, entry in entries
+    ]
+    errors = [
+        [name, *(f"{error:.4f}" for error in entry["nmae_windows"].values())]
+        for name, entry in entries
+    ]
+    windows = [f"{window} steps" for window in first["nmae_windows"]]
     return [
         html.paragraph(
             f"Plant {result['plant']}, seed {result['seed']}, model {result['checkpoint']}. Score "
             f"and LQ ratio with a packet at every step, {first['n_curve_devices']} devices; "
-            f"tolerances from {first['n_devices']} devices; NMAE over {first['n_rollouts']} "
-            "rollouts. In brackets: 95 % bootstrap intervals."
+            f"tolerances from {first['n_devices']} devices. In brackets: 95 % bootstrap intervals."
         ),
-        html.table(columns, rows),
+        html.table(
+            ["method", "score", "LQ ratio", "bits", "gap D* [steps]", "delivery p*"], tolerances
+        ),
+        html.paragraph(
+            f"Error of the force (NMAE) by steps since a single packet, {first['n_rollouts']} "
+            "rollouts."
+        ),
+        html.table(["method", *windows], errors),
     ]
 
 
-def scale_section(result: Mapping[str, Any]) -> list[str]:
+def in_order(named: Mapping[str, Any], first: Sequence[str]) -> list[tuple[str, Any]]:
+    """Pairs of name and value: those named ``first`` in that order, then the rest."""
+    return [(name, named[name]) for name in dict.fromkeys((*first, *named)) if name in named]
+
+
+def scale_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
     """Device counts with their intervals, and the gains."""
     by_method: dict[str, list[Mapping[str, Any]]] = {}
     for row in result["rows"]:
@@ -276,16 +309,15 @@ def scale_section(result: Mapping[str, Any]) -> list[str]:
 def gained(found: Mapping[str, Any]) -> str:
     """How many more devices a method carries than another."""
     low, high = found["ratio_ci95"]
-    between = "" if None in (low, high) else f" ({percent(low)} to {percent(high)})"
     return (
         f"{found['method']} over {found['over']} at {found['snr_db']:g} dB: "
-        f"{percent(found['ratio'])}{between} devices."
+        f"{percent(found['ratio'])} ({percent(low)} to {percent(high)}) devices."
     )
 
 
-def percent(ratio: float) -> str:
+def percent(ratio: float | None) -> str:
     """1.38 → +38.0 %."""
-    return f"{100 * (ratio - 1):+.1f} %"
+    return "unbounded" if ratio is None else f"{100 * (ratio - 1):+.1f} %"
 
 
 def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
@@ -297,14 +329,17 @@ def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
 
     text = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode()
     rows = list(csv.DictReader(io.StringIO(text)))
-    return {"training": ("Training", figures.training_figure(rows))} if rows else {}
+    if len({row["step"] for row in rows}) < 2:
+        return {}
+    return {"training": ("Training", figures.training_figure(rows))}
 
 
 def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
     """Score against gap and delivery, error against the horizon."""
     from hjepa_cli import figures
 
-    entries, step_s = result["methods"], plant(result["plant"]).step_s
+    entries = dict(in_order(result["methods"], config["methods"]))
+    step_s = plant(result["plant"]).step_s
     level = config["protocol"]["acceptable_score"]
     return {
         "gap": (

@@ -37,6 +37,8 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
             screen.say(f"{record.directory} is finished; this is its result")
             return record.result
         folder = record.directory
+        if settings.preset == report.SMOKE:
+            screen.say(report.NO_RESULT)
         work = stages(settings, screen, folder)
         parts = plan.reproduce_parts(settings)
         expected_s = {name: round(seconds) for name, (_, seconds) in parts.items()}
