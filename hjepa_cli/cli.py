@@ -83,9 +83,14 @@ def _run_command(argv: list[str], errors: TextIO) -> int:
 
 def _expected(error: Exception, argv: list[str]) -> HjepaError:
     """Every exception as one of ours: a message, a hint and an exit code."""
-    names = list(get_command(app).commands)  # type: ignore[attr-defined]
-    command = next((word for word in argv if word in names), None)
-    usage = f"hjepa {command} --help" if command else f"commands: {', '.join(names)}"
+    named, group = [], get_command(app)
+    for word in argv:
+        if word in (inside := getattr(group, "commands", {})):
+            named.append(word)
+            group = inside[word]
+    usage = f"commands: {', '.join(getattr(group, 'commands', {}))}"
+    if named:
+        usage = f"hjepa {' '.join(named)} --help"
     if isinstance(error, HjepaError):
         if error.hint is None:
             again = "restore the file or make it again; what this command reads: "

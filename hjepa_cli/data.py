@@ -95,6 +95,7 @@ def preview(
     """Draw a contact sheet: one trajectory per row, time from left to right.
 
     Raises:
+        UsageError: no PNG file.
         MissingInputError: no dataset, or no Pillow.
         DataError: the dataset is damaged.
     """
@@ -106,6 +107,8 @@ def preview(
         raise MissingInputError(
             "a preview needs Pillow, which is not installed", hint='pip install "hjepa[plot]"'
         ) from None
+    if out is not None and out.suffix != ".png":
+        raise UsageError(f"a preview is a PNG file, not '{out.suffix}'; --out FILE.png")
     data = opened(path, screen)
     recorded = data.split(split)[:rows]
     steps = np.linspace(0, recorded.steps - 1, min(columns, recorded.steps)).round().astype(int)
@@ -120,6 +123,7 @@ def preview(
         for row in range(len(recorded))
     ]
     target = out or Path(f"{data.path.name}-{split}.png")
+    files.make_directory(target.parent)
     pictures.save_png(pictures.contact_sheet(frames, captions), target)
     screen.say(f"{len(recorded)} trajectories of {data.path}: {target}")
     return {"dataset": str(data.path), "split": split, "picture": str(target)}
@@ -143,6 +147,7 @@ def export(
     data = opened(path, screen)
     recorded = data.split(split)
     target = out or default_name(data, split, kind)
+    files.make_directory(target.parent)
     system = plant(data.plant)
     limit_n, camera = system.force_limit_n, system.camera()
     values = exports.columns(recorded, system.teacher()(recorded.states[:, 0]), limit_n)

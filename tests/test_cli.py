@@ -396,6 +396,21 @@ def test_every_error_is_one_line_with_its_code(shell, stage, error, code):
     assert outcome.err.splitlines() == lines
 
 
+def test_hints_name_the_command_in_full(shell):
+    for line in (
+        "config show nonsense",
+        "data export --split val",
+        "models verify nowhere --quiet",
+    ):
+        outcome = shell(*line.split())
+        command, sub_command, *_ = line.split()
+        if "--help" in outcome.err:
+            assert f"hint: hjepa {command} {sub_command} --help" in outcome.err
+    assert "hint: commands: info, verify" not in shell("data", "bogus").err
+    assert shell("bogus").err.splitlines()[1].startswith("hint: commands: collect, ")
+    assert shell("data", "bogus").err.splitlines()[1] == "hint: hjepa data --help"
+
+
 def test_disk_errors_name_the_file(shell, stage):
     stage.error = OSError(errno.ENOSPC, "No space left on device", "runs/x")
     assert_one_line_error(shell("collect", "--quiet"), 74, "No space left on device", "runs/x")

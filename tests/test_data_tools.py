@@ -154,7 +154,7 @@ def test_stored_frames_are_exported_as_they_are(shell):
 
 
 def test_export_without_pixels(shell):
-    arrays, _ = exported(shell, "a.npz", "--no-pixels")
+    arrays, _ = exported(shell, "new/folder/a.npz", "--no-pixels")
     assert set(arrays) == COLUMNS - {"pixels"}
 
 
@@ -164,6 +164,7 @@ def test_bad_exports_are_refused_before_anything_is_written(shell):
         assert_one_line_error(shell("data", "export", "--format", "zarr"), 2, "zarr", "hdf5")
         assert_one_line_error(shell("data", "export", "--split", "val"), 2, "val", "train, test")
         assert_one_line_error(shell("data", "preview", "--rows", "0"), 2, "--rows")
+        assert_one_line_error(shell("data", "preview", "--out", "a.jpg"), 2, ".jpg", "FILE.png")
         plan = shell("data", "export", "--dry-run", "--json").document["plan"]
     assert "render 36 frames" in plan["work"]
 

@@ -263,6 +263,18 @@ def test_view_writes_mp4(tmp_path):
         assert np.abs(shown - np.asarray(drawn)).mean() < 6
 
 
+def test_a_folder_for_the_file_is_made_before_anything_is_simulated(shell, checkpoint, monkeypatch):
+    monkeypatch.setattr("hjepa_cli.stages.view.film", lambda *_: pytest.fail("simulated"))
+    Path("file").write_text("")
+    outcome = shell("view", "--out", "file/a.gif", "--checkpoint", checkpoint, "--quiet")
+    assert_one_line_error(outcome, 74, "file")
+    monkeypatch.undo()
+    arguments = ("view", "--checkpoint", checkpoint, "--config", shell.directory / "small.toml")
+    monkeypatch.chdir(shell.directory)
+    assert shell(*arguments, "--every", "12", "--out", "new/a.gif", "--quiet").code == 0
+    assert Path("new/a.gif").stat().st_size > 0
+
+
 def test_dry_run_says_what_would_be_drawn(shell, checkpoint):
     with shell.untouched():
         outcome = shell("view", "--checkpoint", checkpoint, "--dry-run", "--devices", "5")

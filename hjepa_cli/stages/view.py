@@ -29,6 +29,7 @@ from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.evaluate import open_subject
+from hjepa_cli.storage import files
 
 FADING_KEY = 0xFAD1
 PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encoded in seconds
@@ -146,11 +147,13 @@ def run(
         ) from None
     if not live:
         animation.check_target(out)
+        files.make_directory(out.parent)
     elif not screen.is_terminal:
         raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
     subject = open_subject(settings, screen, checkpoint, None)
     if subject.model is None:
-        raise MissingInputError(f"no model of plant {settings.plant}", hint="hjepa train-hierarchy")
+        train = f"hjepa reproduce --preset {settings.preset}"
+        raise MissingInputError(f"no model of plant {settings.plant}", hint=train)
     check_methods(settings.methods, subject.model)
 
     link = make_link(settings, subject.model, devices, snr_db, delivery, gap_steps)
