@@ -75,7 +75,7 @@ class Screen:
 
     def result(self, text: str) -> None:
         """Print one line of the outcome, also when quiet."""
-        print(one_line(text), file=self._results, flush=True)
+        self._print_result(one_line(text))
 
     def error(self, message: str, hint: str | None = None) -> None:
         """Print what was wrong and, on a second line, what to do next."""
@@ -101,13 +101,15 @@ class Screen:
         cells = [[_cell(value) for value in row] for row in rows]
         width = shutil.get_terminal_size((80, 24)).columns
         lines = textwrap.wrap(one_line(title), width) + layout(columns, cells, width)
-        print("\n".join(lines), file=self._results, flush=True)
+        self._print_result("\n".join(lines))
 
     @contextmanager
     def progress(
         self, label: str, total: int, unit: str = "", *, done: int = 0
     ) -> Iterator[Advance]:
         """Show how far a loop is: a bar on a terminal, otherwise a line every ten seconds.
+
+        Inside another one, a bar gives way to a line when it is full.
 
         Args:
             label: what is being done, one word or two.
@@ -123,6 +125,7 @@ class Screen:
             yield heartbeat
             heartbeat.finish()
         else:
+            is_inner = self._bars is not None
             with self._open_bars() as bars:
                 task = bars.add_task(
                     label, total=total, completed=done, count="", rate="", fields=""
@@ -131,6 +134,9 @@ class Screen:
                 bar.advance(0)
                 yield bar
                 bars.refresh()
+                if is_inner:
+                    bars.remove_task(task)
+                    self.say(f"{label} {bar}")
 
     @contextmanager
     def _open_bars(self) -> Iterator["RichProgress"]:
@@ -160,6 +166,15 @@ class Screen:
             finally:
                 self._bars = None
 
+    def _print_result(self, text: str) -> None:
+        """To stdout; above the bars, where they are in the same terminal."""
+        if self._bars is not None and self._results.isatty():
+            self._bars.console.print(
+                text, markup=False, highlight=False, emoji=False, soft_wrap=True
+            )
+        else:
+            print(text, file=self._results, flush=True)
+
     @property
     def _results(self) -> TextIO:
         return self._stderr if self.json else self._stdout
@@ -179,15 +194,24 @@ class _Bar:
         self._fields = ""
         self._started_s = time.monotonic()
 
+    def __str__(self) -> str:
+        """How far it is, since when."""
+        elapsed_s = time.monotonic() - self._started_s
+        return f"{self._counted} {self._fields} in {_clock(elapsed_s)}".replace("  ", " ")
+
+    @property
+    def _counted(self) -> str:
+        share = _percent(self._done, self._total)
+        return f"{self._done}/{self._total}" if self._unit else share
+
     def advance(self, count: int = 1, **fields: float) -> None:
         self._done += count
         self._fields = _fields(fields) or self._fields
         rate = (self._done - self._before) / max(time.monotonic() - self._started_s, 1e-9)
-        counted = f"{self._done}/{self._total}"
         self._bars.update(
             self._task,
             advance=count,
-            count=counted if self._unit else _percent(self._done, self._total),
+            count=self._counted,
             rate=f"{_significant(rate)} {self._unit}/s" if self._unit else "",
             fields=self._fields,
         )

@@ -222,6 +222,47 @@ def test_bar_on_a_terminal_shows_label_count_rate_loss_and_eta(monkeypatch):
     assert "33 %" in text and "1/3" not in text
 
 
+def test_tables_and_results_stand_above_the_bars_of_a_terminal(monkeypatch):
+    """Bars are drawn over again all the time: what is printed past them would be wiped out."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("LINES", "40")
+    terminal = Terminal()  # stdout and stderr, as in a shell
+    screen = Screen(stdout=terminal, stderr=terminal)
+    with screen.progress("all stages", 2) as outer:
+        with screen.progress("first", 3, "frames") as inner:
+            inner.advance(3, loss=0.5)
+        screen.table("counts", ["method", "n"], [["a", "1"], ["b", "2"], ["c", "3"]])
+        screen.result("the result [/x]")
+        outer.advance(2)
+    shown = replay(terminal.getvalue(), 40)
+    text = "\n".join(shown)
+    for line in ("counts", "method  n", "a       1", "b       2", "c       3", "the result [/x]"):
+        assert line in shown, text
+    assert "first 3/3 loss 0.5 in 0:00:00" in shown and text.count("first") == 1
+    assert shown[-1].startswith("all stages") and "100 %" in shown[-1]
+
+
+def replay(written, rows):
+    """What a terminal shows in the end, of rich's moves of the cursor."""
+    lines, row, column = [""] * rows, 0, 0
+    for code, letter, character in re.findall(
+        r"\x1b\[([0-9;?]*)([A-Za-z])|(.)", written, re.DOTALL
+    ):
+        if letter == "A":
+            row -= int(code or 1)
+        elif letter == "K" and code == "2":
+            lines[row] = ""
+        elif character == "\n":
+            row, column = row + 1, 0
+        elif character == "\r":
+            column = 0
+        elif character:
+            lines[row] = lines[row][:column].ljust(column) + character + lines[row][column + 1 :]
+            column += 1
+    return [line.rstrip() for line in lines if line.strip()]
+
+
 def test_forced_colours_do_not_turn_a_file_into_a_terminal(streams, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     screen = screen_on(streams)
