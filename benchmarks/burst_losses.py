@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--method", default="oracle")
     parser.add_argument("--checkpoint", help="zoo name, run directory or file")
     parser.add_argument("--coherence", default="1,2,5,10,20", help="mean slots T, a list")
-    parser.add_argument("--gaps", default="2,5,10,20,40,80,160", help="1/p of the curve")
+    parser.add_argument("--gaps", default="1,2,5,10,20,40,80,160", help="1/p of the curve")
     parser.add_argument("--devices", type=int, default=128)
     options = parser.parse_args()
     settings = load_settings()

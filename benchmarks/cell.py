@@ -52,7 +52,7 @@ def main() -> None:
                 margin_db=10.0,
                 k_factor_db=-math.inf,
                 coherence_slots=1.0,
-                block_error=0.0,
+                round_errors=(0.0,),
                 growth=growth,
                 seed=0,
             )

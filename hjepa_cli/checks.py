@@ -43,6 +43,7 @@ SCHEDULERS = (
 )
 
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
+MAX_HARQ_ROUNDS = 16
 LARGEST_SEED = 2**63 - 1
 LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
 LARGEST_STRIDE = 10_000
@@ -150,6 +151,10 @@ def _check_radio(radio: RadioSettings) -> None:
         raise UsageError(f"radio.coherence_slots = {radio.coherence_slots:g}; expected 1 or more")
     if radio.block_error > 0.5:
         raise UsageError(f"radio.block_error = {radio.block_error:g}; expected at most 0.5")
+    if radio.harq_rounds > MAX_HARQ_ROUNDS:
+        raise UsageError(
+            f"radio.harq_rounds = {radio.harq_rounds}; expected 1 to {MAX_HARQ_ROUNDS}"
+        )
     if radio.topology == "hall" and radio.law != "scheduled":
         raise UsageError(
             f"topology hall is for the law scheduled; law {radio.law} starts from the SNR itself"

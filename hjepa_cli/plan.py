@@ -266,7 +266,7 @@ def _plan_scheduled(
     radio = settings.radio
     methods = [name for name in subject.measurable(settings.methods) if name != "optimal"]
     searches = len(radio.schedulers) * radio.seeds
-    if radio.topology == "hall":  # margins depend on the SNR
+    if radio.load_depends_on_snr:
         searches *= len(snr_db)
     return Plan(
         command="scale",

@@ -187,11 +187,17 @@ class RadioSettings:
     coherence_slots: float
     overhead_bits: int
     block_error: float
+    harq_rounds: int
     topology: Literal["target", "hall"]
     scenario: Literal["InF-LOS", "InF-SL", "InF-DL", "InF-SH", "InF-DH"]
     carrier_ghz: float
     power_dbm: float
     noise_figure_db: float
+
+    @property
+    def load_depends_on_snr(self) -> bool:
+        """Law scheduled: by the halls' margins, or by what several copies of a packet are worth."""
+        return self.topology == "hall" or (self.harq_rounds > 1 and self.block_error > 0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,6 +37,7 @@ def test_duty_row_by_hand():
     found = row("duty", entry(gap=100.0))
     c = 20e6 * 1e-3 * math.log2(101) / 2064  # 64.5 packets per slot
     assert found["devices"] == math.floor(100 * c) == 6451
+    assert found["load_per_block"] == pytest.approx(6451 / c)  # D*, but for the floor
     assert found["devices_ci95"] == [math.floor(90 * c), math.floor(110 * c)]
     assert found["bits_per_s"] == pytest.approx(2064 / 0.1)
     assert found["ratio_to_limit"] == pytest.approx(20640 / 13.229262922)
@@ -50,6 +51,7 @@ def test_equal_row_by_hand():
         return math.floor(20_000 / 2064 * math.log2(1 - 100 * math.log(p)))
 
     assert found["devices"] == devices(0.02) == 83
+    assert found["load_per_block"] == pytest.approx(83 * 2064 / (20_000 * math.log2(101)))
     assert found["devices_ci95"] == [devices(0.022), devices(0.018)]  # less needed: more devices
     assert found["tolerance_ci95"] == pytest.approx([0.018, 0.022])
     assert found["bits_per_s"] == pytest.approx(0.02 * 2064 / 1e-3)
@@ -72,6 +74,7 @@ def test_a_method_without_a_link_has_no_count():
     for law in ("duty", "equal"):
         found = row(law, entry(gap=None, p=None, bits=None))
         assert found["devices"] is found["devices_ci95"] is found["bits_per_s"] is None
+        assert found["load_per_block"] is None
         assert "sees every state" in found["reason"]
 
 

@@ -19,10 +19,12 @@ from hjepa_cli.core.controllers import LastForce, StrideController
 from hjepa_cli.core.growth import Growth
 from hjepa_cli.core.loop import Draws, every_step, gap_schedule, simulate
 from hjepa_cli.core.methods import true_state_method
+from hjepa_cli.core.metrics import first_crossing
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.scheduled import (
     MAX_BISECTIONS,
     LoadPoint,
+    blocks_for,
     combine,
     find_load,
 )
@@ -49,7 +51,7 @@ def access(scheduler="round-robin", blocks=1, **changes):
         "margin_db": NO_FADING,
         "k_factor_db": -math.inf,
         "coherence_slots": 1.0,
-        "block_error": 0.0,
+        "round_errors": (0.0,),
         "growth": ANY_GROWTH,
         "seed": 0,
     }
@@ -82,6 +84,33 @@ def test_round_robin_without_fading_is_duty_exactly(name, devices):
     assert ours.packets.sum() == 299
 
 
+@pytest.mark.parametrize("blocks", [2, 3])
+def test_turns_on_several_blocks_are_duty_with_other_phases(blocks):
+    load, steps = 13, 200
+    phases = np.arange(load * blocks) // blocks
+    schedule = np.arange(steps)[:, None] % load == phases
+    schedule[0] = True
+    ours = cell("hold-true", load * blocks, access(blocks=blocks), steps=steps)
+    assert np.array_equal(ours.score, given("hold-true", schedule).score[0])
+
+
+def test_turns_without_fading_carry_what_duty_tolerates():
+    """Counts within 1/D* of each other: loads within a device per block."""
+    steps, devices, level = 400, 200, 0.62
+    teacher = given("optimal", every_step(steps, devices)).score[0]
+    gaps = np.arange(35.0, 60.0, 3.0)
+    scores = [given("hold-true", gap_schedule(d, steps, devices)).score.mean() for d in gaps]
+    tolerance = first_crossing(gaps, np.array(scores) / teacher.mean(), level, log=False)
+
+    def simulate_load(load):
+        blocks = blocks_for(load)
+        found = cell("hold-true", load * blocks, access(blocks=blocks), steps=steps)
+        return LoadPoint(load, blocks, found, teacher[: load * blocks])
+
+    found = find_load(simulate_load, level, 0.03, replicates=10, seed=0, start=45.0)
+    assert found.load == pytest.approx(tolerance, abs=1.0)
+
+
 @pytest.mark.parametrize("scheduler", ["round-robin", "opportunistic", "max-aoi", "whittle"])
 def test_a_block_for_everybody_is_a_perfect_link(scheduler):
     ours = cell("hold-true", 9, access(scheduler, blocks=9), plant_spread=0.2)
@@ -107,8 +136,19 @@ def test_fades_beyond_the_margin_cost_round_robin_its_turns():
 
 
 def test_block_errors_are_lost():
-    found = cell("hold-true", 10, access(block_error=0.2), steps=800)
+    found = cell("hold-true", 10, access(round_errors=(0.2,)), steps=800)
     assert abs(found.packets.sum() / 799 - 0.8) < 4 * math.sqrt(0.16 / 799)
+
+
+def test_copies_of_a_lost_sample_are_combined():
+    alone, repeated = (
+        cell("hold-true", 10, access(round_errors=errors), steps=1200)
+        for errors in ((0.5,), (0.5, 0.0))
+    )
+    # A packet takes 2 transmissions on average, or 1.5: half of them a second copy.
+    assert abs(alone.packets.sum() / 1199 - 1 / 2) < 4 * math.sqrt(0.25 / 1199)
+    assert abs(repeated.packets.sum() / 1199 - 2 / 3) < 4 * math.sqrt(0.25 / 1199)
+    assert repeated.score.mean() > alone.score.mean()
 
 
 def test_devices_of_one_margin_each():
@@ -183,7 +223,7 @@ def test_devices_take_turns_to_look_once_they_may_have_something_to_say():
     growth = Growth(
         np.r_[np.full(12, 1e-9), np.ones(300)]
     )  # nothing can have gone wrong before age 13
-    uplink = Uplink(access("innovation", growth=growth, block_error=1.0), 10)
+    uplink = Uplink(access("innovation", growth=growth, round_errors=(1.0,)), 10)
     looked = np.zeros((21, 10))
     for slot in range(21):
         uplink.begin()

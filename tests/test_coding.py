@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from hjepa_cli.core import channel
 from hjepa_cli.core.coding import (
@@ -11,6 +12,7 @@ from hjepa_cli.core.coding import (
     mean_age_slots,
     normal_approximation_error,
     packet_uses,
+    round_errors,
 )
 from hjepa_cli.errors import UsageError
 
@@ -52,6 +54,23 @@ def test_outage_agrees_with_the_normal_approximation_in_fading():
 def test_impossible_block_errors_are_refused(error):
     with pytest.raises(UsageError):
         packet_uses(100, 10.0, error)
+
+
+def test_copies_of_a_packet_add_their_snrs():
+    bits, snr_db, error = 48, 5.0, 0.3
+    uses, snr = packet_uses(bits, snr_db, error), 10**0.5
+    left = 1.0
+    for copies, conditional in enumerate(round_errors(bits, snr_db, error, 3), start=1):
+        left *= conditional
+        capacity = math.log2(1 + copies * snr)
+        dispersion = (1 - (1 + copies * snr) ** -2) * math.log2(math.e) ** 2
+        bits_left = uses * capacity - bits + 0.5 * math.log2(uses)
+        expected = stats.norm.sf(bits_left / math.sqrt(uses * dispersion))
+        assert left == pytest.approx(expected, rel=1e-6)
+    assert round_errors(bits, snr_db, error, 1) == (error,)
+    assert round_errors(2064, 100.0, 0.1, 16)[1] < 0.01  # also where SNRs end
+    assert round_errors(2064, 20.0, 0.0, 4) == (0.0,)
+    assert round_errors(2064, 20.0, 0.1, 3) == pytest.approx((0.1, 0.0, 0.0), abs=1e-12)
 
 
 @pytest.mark.parametrize(

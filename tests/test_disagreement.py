@@ -90,7 +90,7 @@ def test_levels_that_know_nothing_leave_the_growth_table():
 def test_the_uplink_serves_the_doubted_first():
     levels = calibrate_levels(AGES, *devices(78, 1.0, 6))
     for scheduler in ("whittle", "innovation"):
-        known = Access(scheduler, 1, 300.0, -np.inf, 1.0, 0.0, levels.growth, 0, levels)
+        known = Access(scheduler, 1, 300.0, -np.inf, 1.0, (0.0,), levels.growth, 0, levels)
         uplink = Uplink(known, 3)
         uplink.begin()
         uplink.grant()

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 from command_line import assert_one_line_error, open_shell
 
@@ -27,8 +28,8 @@ def shell(tmp_path, monkeypatch, capsys):
 
 
 def uplink(blocks, devices):
-    growth = Growth([1.0])
-    return Uplink(Access("max-aoi", blocks, 10.0, -math.inf, 1.0, 0.0, growth, 0), devices)
+    growth = Growth(np.ones(1))
+    return Uplink(Access("max-aoi", blocks, 10.0, -math.inf, 1.0, (0.0,), growth, 0), devices)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +71,8 @@ def test_refused_by_the_functions(refused, message):
         ((), "carrier_ghz = 100.5", "0.5 to 100"),
         ((), 'scenario = "InF-XX"', "InF-SH"),
         ((), "block_error = 0.7", "at most 0.5"),
+        ((), "harq_rounds = 17", "1 to 16"),
+        ((), "harq_rounds = 0", "at least 1"),
     ],
 )
 def test_refused_by_the_command(flags, config, message, shell):

@@ -10,6 +10,7 @@ from command_line import assert_one_line_error, open_shell
 
 from hjepa_cli.core import scheduled as core_scheduled
 from hjepa_cli.core.coding import packet_uses
+from hjepa_cli.core.hall import drop_devices
 from hjepa_cli.core.loop import Draws, every_step, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.plant import plant
@@ -73,6 +74,9 @@ def test_document_table_and_reports(stage):
     bits = 2064 + ours["reports_per_block_slot"] * report_bits(ours["devices"])
     slot_bits = 20e3 * math.log2(101)
     assert ours["devices"] == math.floor(ours["load_per_block"] * slot_bits / bits)
+    per_slot = ours["packets_per_block_slot"] * 2064 + bits - 2064
+    assert ours["bits_per_s"] == pytest.approx(1000 * per_slot / ours["load_per_block"])
+    assert ours["ratio_to_limit"] == pytest.approx(ours["bits_per_s"] / 13.229262922)
     low, high = ours["devices_ci95"]
     assert low <= ours["devices"] <= high
     (found,) = result["gains"]
@@ -101,6 +105,45 @@ def test_hall_coherence_and_seeds(stage):
     assert row["devices"] == math.floor(row["load_per_block"] * 20e3 / packet_uses(2064 + 24, 20.0))
 
 
+def test_reports_carry_the_overhead_of_packets(stage):
+    result = stage("hold-true", schedulers=["innovation"], overhead_bits=24, snr_db="20")
+    (row,) = result["rows"]
+    bits = 2064 + 24 + row["reports_per_block_slot"] * (report_bits(row["devices"]) + 24)
+    assert row["devices"] == math.floor(row["load_per_block"] * 20e3 * math.log2(101) / bits)
+    per_slot = row["packets_per_block_slot"] * 2088 + bits - 2088
+    assert row["bits_per_s"] == pytest.approx(1000 * per_slot / row["load_per_block"])
+
+
+def test_margins_of_a_hall_by_hand(stage, monkeypatch):
+    seen = []
+
+    def simulate_cell(*arguments):
+        seen.append((arguments[3], arguments[4]))
+        return real(*arguments)
+
+    real = scheduled_cell.simulate_cell
+    monkeypatch.setattr(scheduled_cell, "simulate_cell", simulate_cell)
+    stage("zero-true", schedulers=["max-aoi"], topology="hall", snr_db="10,20")
+    noise_dbm = -174 + 10 * math.log10(20e6) + 6
+    drop = drop_devices("InF-SH", 3.75, 100, 0)
+    devices, access = seen[-1]  # of the last SNR
+    expected = 23 - (20 + noise_dbm + drop.loss_db[:devices])
+    assert access.margin_db == pytest.approx(expected, abs=1e-6)
+    assert access.k_factor_db == pytest.approx(drop.k_factor_db[:devices])
+    assert seen[0][1].margin_db[0] == pytest.approx(expected[0] + 10)  # 10 dB less to reach
+
+
+def test_copies_of_a_sample_carry_more_where_many_are_lost(stage):
+    lossy = {"schedulers": ["round-robin"], "power_margin_db": 300.0, "block_error": 0.5}
+    fresh, copied = (
+        stage("hold-true", harq_rounds=rounds, snr_db="20:25", **lossy)["rows"] for rounds in (1, 3)
+    )
+    assert copied[0]["load_per_block"] > 1.1 * fresh[0]["load_per_block"]
+    assert fresh[0]["curve"] == fresh[1]["curve"]  # of both SNRs
+    assert fresh[0]["packets_per_block_slot"] == pytest.approx(0.5, abs=0.1)
+    assert copied[0]["packets_per_block_slot"] == pytest.approx(2 / 3, abs=0.1)
+
+
 def test_a_slot_too_small_for_a_packet_is_said(stage):
     result = stage("hold-true", bandwidth_hz=1e4, snr_db="10")
     assert all(row["devices"] == 0 for row in result["rows"])
@@ -121,6 +164,14 @@ def test_verify_simulates_both_sides_of_each_load(stage, monkeypatch):
     for check, share in ((inner, 0.7), (outer, 1.4)):
         assert check["load"] == pytest.approx(share * row["load_per_block"], rel=0.02)
     assert stage.out.getvalue().count(" verified") == 2
+
+
+def test_verify_goes_beyond_the_largest_load_of_a_search(stage, monkeypatch):
+    monkeypatch.setattr(scheduled_cell, "VERIFY_AT", (0.7, 1.4))
+    for name in ("BLOCK_DEVICES", "MAX_LOAD"):  # of the teacher beside them
+        monkeypatch.setattr(scheduled_cell, name, 10)
+    result = stage("hold-true", schedulers=["round-robin"], verify=True, seeds=2, snr_db="20")
+    assert [check["passed"] for check in result["verify"]] == [True, True]
 
 
 def test_verify_fails_where_the_interval_decides_nothing(stage, monkeypatch):

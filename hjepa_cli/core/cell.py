@@ -80,13 +80,17 @@ class Cell:
     limit_bits_per_s: float
 
     def row(self, need: Need, snr_db: float) -> Row:
-        """Count one method's devices at one SNR."""
+        """Count one method's devices at one SNR.
+
+        A block is what one packet takes at γ̄; ``load_per_block`` is devices ÷ blocks of a slot.
+        """
         row: Row = {
             "snr_db": snr_db,
             "method": need.method,
             "devices": None,
             "devices_ci95": None,
             "at_least": need.at_least,
+            "load_per_block": None,
             "bits_per_s": None,
             "ratio_to_limit": None,
             "bits_per_transmission": need.payload_bits,
@@ -99,6 +103,8 @@ class Cell:
         ends = need.interval or (need.tolerance, need.tolerance)
         row["devices"] = self._devices(need.tolerance, need.payload_bits, snr_db)
         row["devices_ci95"] = [self._devices(end, need.payload_bits, snr_db) for end in ends]
+        link = (need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
+        row["load_per_block"] = row["devices"] / float(slot_capacity(*link))
         if need.packets_per_slot is not None:
             row["bits_per_s"] = need.payload_bits * need.packets_per_slot / self.slot_s
             if self.limit_bits_per_s > 0:

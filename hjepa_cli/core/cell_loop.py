@@ -82,7 +82,7 @@ def simulate_cell(
     """
     uplink, world = Uplink(access, devices), World(plant, *streamed_draws(protocol, devices, seed))
     controller: Any = method.controller(devices)
-    packets, steps = np.zeros(devices, dtype=np.int64), protocol.steps
+    outbox, packets, steps = Outbox(), np.zeros(devices, dtype=np.int64), protocol.steps
     for k in range(steps):
         uplink.begin()
         if access.levels and k:
@@ -91,9 +91,32 @@ def simulate_cell(
             _report(uplink, world, controller, method, plant.force_limit_n)
         arrived = uplink.grant()
         packets += arrived if k else 0
-        world.move(controller.act(arrived, world.sense(method.sensor, arrived)))
+        fresh = world.sense(method.sensor, uplink.sampled)
+        world.move(controller.act(arrived, outbox.deliver(fresh, uplink.sampled, arrived)))
         tick(devices)
     return CellOutcome(world.score / steps, world.cost / steps, packets, uplink.reports, steps)
+
+
+class Outbox:
+    """What devices have sampled and not yet brought to the controller: copies of it may follow."""
+
+    def __init__(self) -> None:
+        self._kept: Any = None
+
+    def deliver(self, fresh: Any, sampled: Bools, arrived: Bools) -> Any:
+        """Take the new samples, and hand out the packets that arrive; ``None`` where none does.
+
+        Args:
+            fresh: packets [sampled.sum(), ...] of the devices that sample in this slot [N].
+            sampled, arrived: devices [N].
+        """
+        if self._kept is None:  # of everybody: all are heard in the first slot
+            self._kept = fresh
+        if np.array_equal(sampled, arrived):
+            return fresh
+        if fresh is not None:
+            self._kept[np.flatnonzero(sampled)] = fresh
+        return self._kept[np.flatnonzero(arrived)] if arrived.any() else None
 
 
 def measure_growth(

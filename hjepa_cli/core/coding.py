@@ -38,11 +38,7 @@ def normal_approximation_error(
     bits, n = np.asarray(payload_bits, np.float64), np.asarray(channel_uses, np.float64)
     if not (np.all(bits > 0) and np.all(n > 0)):
         raise UsageError("payload and channel uses of a packet must be above 0")
-    snr = snr_ratio(snr_db)
-    capacity = np.log2(1.0 + snr)
-    dispersion = (1.0 - (1.0 + snr) ** -2) / math.log(2.0) ** 2
-    margin = (n * capacity - bits + 0.5 * np.log2(n)) / np.sqrt(n * dispersion)
-    return np.asarray(stats.norm.sf(margin))[()]
+    return np.asarray(_block_error(bits, n, snr_ratio(snr_db)))[()]
 
 
 def packet_uses(payload_bits: float, snr_db: float, block_error: float = 0.0) -> float:
@@ -75,6 +71,29 @@ def packet_uses(payload_bits: float, snr_db: float, block_error: float = 0.0) ->
         else:
             high = middle
     return high
+
+
+def round_errors(
+    payload_bits: float, snr_db: float, block_error: float, rounds: int
+) -> tuple[float, ...]:
+    """Return the error rate of each copy of a packet, given that all before it failed.
+
+    Every copy arrives at the same SNR γ (power control) and the receiver adds their SNRs (chase
+    combining): after m copies the block error rate is that of a packet at m γ.
+
+    Args:
+        payload_bits: b, everything included.
+        snr_db: γ of each copy.
+        block_error: of the first copy, which fixes its length; see :func:`packet_uses`.
+        rounds: M ≥ 1 copies at most; 1 sends a new sample instead.
+    """
+    if rounds == 1 or block_error == 0.0:
+        return (block_error,)
+    uses = packet_uses(payload_bits, snr_db, block_error)
+    combined = float(snr_ratio(snr_db)) * np.arange(1, rounds + 1)
+    left = _block_error(np.asarray(payload_bits), np.asarray(uses), combined)
+    conditional = left[1:] / np.maximum(left[:-1], np.finfo(float).tiny)
+    return (block_error, *np.minimum(conditional, 1.0).tolist())
 
 
 def chase_outage_probability(
@@ -124,3 +143,11 @@ def mean_age_slots(
     mean = rounds * mean_drops + mean_m
     square = rounds**2 * square_drops + 2.0 * rounds * mean_drops * mean_m + square_m
     return (mean_m - 1.0) + (square / mean - 1.0) / 2.0
+
+
+def _block_error(bits: FloatArray, uses: FloatArray, snr: FloatArray) -> FloatArray:
+    """The normal approximation at an SNR as a power ratio."""
+    capacity = np.log2(1.0 + snr)
+    dispersion = (1.0 - (1.0 + snr) ** -2) / math.log(2.0) ** 2
+    margin = (uses * capacity - bits + 0.5 * np.log2(uses)) / np.sqrt(uses * dispersion)
+    return np.asarray(stats.norm.sf(margin))

@@ -41,7 +41,9 @@ class Access:
         margin_db: G, of each device or all: fades deeper than this block a device; ∞ blocks nobody.
         k_factor_db: Rician K, of each device or all; −∞ is Rayleigh.
         coherence_slots: mean slots a fade lasts.
-        block_error: share of transmissions that fail although the power sufficed.
+        round_errors: share of transmissions that fail although the power sufficed, of the first copy
+            of a sample, of the second (its copies combined), …; as many as a sample may have. One
+            entry: every transmission carries a new sample.
         growth: of the control error with age, measured for the controller.
         seed: of the fading.
         levels: scales the growth by the disagreement of a controller's levels.
@@ -52,7 +54,7 @@ class Access:
     margin_db: float | Floats
     k_factor_db: float | Floats
     coherence_slots: float
-    block_error: float
+    round_errors: tuple[float, ...]
     growth: Growth
     seed: int
     levels: Levels | None = None
@@ -93,10 +95,13 @@ class Uplink:
             coherence_slots=access.coherence_slots,
         )
         self._errors = generator(access.seed, _ERRORS_KEY)
+        self._round_errors = np.array(access.round_errors)
         self._threshold = 10.0 ** (-_each(access.margin_db, devices) / 10.0)
         self._fair_age = devices / access.blocks
         self._slot = 0
         self._delta = 0.02
+        # Beyond the last entry of the growth table nobody would look, and δ never fall again.
+        self._highest_delta = float(np.clip(math.sqrt(access.growth.table[-1]), *DELTA))
         self._gain = np.ones(devices)
         self._age = np.ones(devices, dtype=np.int64)
         # Before the first slot, device 0 has waited longest.
@@ -105,6 +110,10 @@ class Uplink:
         self._reported = np.zeros(devices)
         self._reported_age = np.zeros(devices, dtype=np.int64)
         self._doubt = np.ones(devices)
+        # Copies that were lost of the sample a device is repeating, and slots since it was taken.
+        self._lost = np.zeros(devices, dtype=np.int64)
+        self._behind = np.zeros(devices, dtype=np.int64)
+        self.sampled = np.zeros(devices, dtype=bool)
         self.reports = 0
 
     @property
@@ -144,7 +153,8 @@ class Uplink:
         self.reports += len(who)
         # The other devices look in other slots: this slot's reports are its share of all.
         excess = len(who) / self._access.blocks - REPORTS_PER_BLOCK
-        self._delta = float(np.clip(self._delta * math.exp(STEERING * excess), *DELTA))
+        steered = self._delta * math.exp(STEERING * excess)
+        self._delta = min(max(steered, DELTA[0]), self._highest_delta)
 
     def grant(self) -> Bools:
         """Hand out the blocks of this slot; returns whose packets arrive [N]. Ends the slot.
@@ -162,16 +172,27 @@ class Uplink:
             growth=self._access.growth,
             doubt=self._doubt,
         )
-        chosen = pick(self._score(view), self._access.blocks)
-        decoded = self._errors.random(len(chosen)) >= self._access.block_error
-        arrived = chosen & self._able & decoded if self._slot else np.ones_like(chosen)
+        repeats = (self._lost > 0) & self._able  # a copy that waits is worth less every slot
+        chosen = pick(np.where(repeats, np.inf, self._score(view)), self._access.blocks)
+        sent = chosen & self._able if self._slot else np.ones_like(chosen)
+        failed = self._errors.random(len(chosen)) < self._round_errors[self._lost]
+        arrived = sent & ~failed if self._slot else sent
+        self._repeat(sent, arrived)
         self._waited = np.where(chosen, 0, self._waited) + 1
         self._queue = np.maximum(self._queue - self._fair_age, 0.0) + self._age
-        self._age = np.where(arrived, 0, self._age) + 1
+        self._age = np.where(arrived, self._behind, self._age) + 1
+        self._behind = np.where(self._lost > 0, self._behind + 1, 0)
         self._reported[arrived] = 0.0
         self._reported_age[arrived] = 0
         self._slot += 1
         return arrived
+
+    def _repeat(self, sent: Bools, arrived: Bools) -> None:
+        """Take note of who sent a new sample, and of who will repeat one."""
+        rounds = len(self._round_errors)
+        self.sampled = sent & (self._lost == 0) & (arrived | (rounds > 1))
+        copies = np.where(sent & ~arrived, self._lost + 1, self._lost)
+        self._lost = np.where(arrived | (copies == rounds), 0, copies)
 
     @property
     def _power(self) -> Floats:

@@ -26,7 +26,7 @@ VERIFY_AT = (0.9, 1.1)  # times the tolerance
 
 CSV_COLUMNS = (
     *("snr_db", "method", "devices", "devices_ci95_low", "devices_ci95_high", "at_least"),
-    *("bits_per_s", "ratio_to_limit", "bits_per_transmission", "reason"),
+    *("load_per_block", "bits_per_s", "ratio_to_limit", "bits_per_transmission", "reason"),
 )
 
 

@@ -80,6 +80,9 @@ def run(
             "topology": radio.topology,
             "power_margin_db": radio.power_margin_db if radio.topology == "target" else None,
             "coherence_slots": radio.coherence_slots,
+            "overhead_bits": radio.overhead_bits,
+            "block_error": radio.block_error,
+            "harq_rounds": radio.harq_rounds,
             "payload": settings.protocol.payload,
             "bandwidth_hz": radio.bandwidth_hz,
             "slot_s": plant(settings.plant).step_s,
@@ -92,8 +95,7 @@ def run(
         result["csv"] = write_csv(record.path("devices.csv"), result["rows"], COLUMNS)
         result["figures"] = draw(result, record.directory, screen)
         if verify:
-            # Without a topology the load is the same at every SNR.
-            checked_db = grid_db if radio.topology == "hall" else grid_db[:1]
+            checked_db = grid_db if radio.load_depends_on_snr else grid_db[:1]
             result["verify"] = [
                 check
                 for name in methods

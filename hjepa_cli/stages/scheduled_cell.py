@@ -10,7 +10,7 @@ import numpy as np
 from hjepa_cli.core.cell import Row
 from hjepa_cli.core.cell_loop import measure_growth, measure_levels, simulate_cell
 from hjepa_cli.core.channel import thermal_noise_dbm
-from hjepa_cli.core.coding import packet_uses
+from hjepa_cli.core.coding import packet_uses, round_errors
 from hjepa_cli.core.disagreement import Levels
 from hjepa_cli.core.growth import Growth
 from hjepa_cli.core.hall import drop_devices, power_margin_db
@@ -93,7 +93,7 @@ class ScheduledCell:
         if found.load == 0:
             level = settings.protocol.acceptable_score
             return row | {"reason": f"below {level:g} even with one device per block"}
-        reported = found.reports_per_slot * report_bits(counts[0])
+        reported = found.reports_per_slot * (report_bits(counts[0]) + radio.overhead_bits)
         per_slot = (found.packets_per_slot * sent_bits + reported) / found.load
         row["bits_per_s"] = per_slot / self._plant.step_s
         if (limit := self._plant.data_rate_limit_bits_per_s) > 0:
@@ -137,20 +137,23 @@ class ScheduledCell:
 
     def _devices(self, load: float, found: SupportedLoad, uses: float, snr_db: float) -> int:
         """N = ⌊load · slot ÷ (packet + reports)⌋; a report's size depends on N, hence the loop."""
-        slot_uses, devices = self._settings.radio.bandwidth_hz * self._plant.step_s, 0
+        radio, devices = self._settings.radio, 0
+        slot_uses = radio.bandwidth_hz * self._plant.step_s
         guess = math.floor(load * slot_uses / uses * (1 + 1e-12))
         for _ in range(5):
             if guess == devices:
                 break
             devices = guess
-            report = packet_uses(report_bits(devices), snr_db, self._settings.radio.block_error)
+            report_sent = report_bits(devices) + radio.overhead_bits
+            report = packet_uses(report_sent, snr_db, radio.block_error)
             block = uses + found.reports_per_slot * report
             guess = math.floor(load * slot_uses / block * (1 + 1e-12))
         return guess
 
     def _load(self, name: str, scheduler: str, snr_db: float) -> SupportedLoad:
-        """The load a block carries; without a topology it is the same at every SNR."""
-        key = (name, scheduler, snr_db if self._settings.radio.topology == "hall" else 0.0)
+        """The load a block carries; often the same at every SNR."""
+        varies = self._settings.radio.load_depends_on_snr
+        key = (name, scheduler, snr_db if varies else 0.0)
         if key not in self._loads:
             found: list[SupportedLoad] = []
             for seed in self._seeds:
@@ -196,7 +199,12 @@ class ScheduledCell:
             margin_db=margin_db,
             k_factor_db=k_factor_db,
             coherence_slots=radio.coherence_slots,
-            block_error=radio.block_error,
+            round_errors=round_errors(
+                method.bits_per_transmission + radio.overhead_bits,
+                snr_db,
+                radio.block_error,
+                radio.harq_rounds,
+            ),
             growth=levels.growth if levels else self._growth_of(name, seed),
             seed=seed,
             levels=levels,
@@ -240,7 +248,7 @@ class ScheduledCell:
         """The teacher's score of the first devices, on the true state at every step."""
         known = self._teacher.get(seed, np.zeros(0))
         if len(known) < devices:  # the first of many devices are the few
-            count = BLOCK_DEVICES if devices <= BLOCK_DEVICES else MAX_LOAD
+            count = BLOCK_DEVICES if devices <= BLOCK_DEVICES else max(devices, MAX_LOAD)
             protocol = self._settings.protocol
             teacher = build_method("optimal", self._settings, None)
             outcome = simulate(
