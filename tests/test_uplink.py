@@ -62,7 +62,9 @@ def test_the_books_are_right(round_errors, monkeypatch):
             assert not np.any(arrived & ~(chosen & view.able))
             for device in np.flatnonzero(chosen & view.able):
                 new = books.send(device, slot, arrived[device])
-                assert uplink.sampled[device] == (new and (arrived[device] or len(round_errors) > 1))
+                assert uplink.sampled[device] == (
+                    new and (arrived[device] or len(round_errors) > 1)
+                )
             assert not np.any(uplink.sampled & ~chosen)
         else:
             assert arrived.all() and uplink.sampled.all()
@@ -88,7 +90,9 @@ def test_embeddings_wait_in_the_outbox_as_they_were_sent():
     assert torch.equal(outbox.deliver(first.clone(), everybody, everybody), first)
     second, third, nobody = np.array([0, 1, 0], bool), np.array([0, 0, 1], bool), ~everybody
     assert outbox.deliver(torch.full((1, 2), 7.0), second, nobody) is None
-    assert torch.equal(outbox.deliver(torch.full((1, 2), 8.0), third, third), torch.full((1, 2), 8.0))
+    assert torch.equal(
+        outbox.deliver(torch.full((1, 2), 8.0), third, third), torch.full((1, 2), 8.0)
+    )
     both = outbox.deliver(torch.full((1, 2), 9.0), third, second | third)
     assert both.tolist() == [[7.0, 7.0], [9.0, 9.0]]
     assert outbox.deliver(None, nobody, nobody) is None

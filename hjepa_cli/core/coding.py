@@ -90,7 +90,7 @@ def round_errors(
     if rounds == 1 or block_error == 0.0:
         return (block_error,)
     uses = packet_uses(payload_bits, snr_db, block_error)
-    combined = float(snr_ratio(snr_db)) * np.arange(1, rounds + 1)
+    combined = snr_ratio(snr_db) * np.arange(1.0, rounds + 1)
     left = _block_error(np.asarray(payload_bits), np.asarray(uses), combined)
     conditional = left[1:] / np.maximum(left[:-1], np.finfo(float).tiny)
     return (block_error, *np.minimum(conditional, 1.0).tolist())

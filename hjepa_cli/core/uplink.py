@@ -41,9 +41,8 @@ class Access:
         margin_db: G, of each device or all: fades deeper than this block a device; ∞ blocks nobody.
         k_factor_db: Rician K, of each device or all; −∞ is Rayleigh.
         coherence_slots: mean slots a fade lasts.
-        round_errors: share of transmissions that fail although the power sufficed, of the first copy
-            of a sample, of the second (its copies combined), …; as many as a sample may have. One
-            entry: every transmission carries a new sample.
+        round_errors: share of transmissions that fail although the power sufficed: of first copies
+            of a sample, of second ones (the copies combined), … One entry: none is repeated.
         growth: of the control error with age, measured for the controller.
         seed: of the fading.
         levels: scales the growth by the disagreement of a controller's levels.
