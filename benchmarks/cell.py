@@ -31,6 +31,7 @@ def main() -> None:
     parser.add_argument("--devices", default="50,200,800,2000")
     parser.add_argument("--steps", default="100,200")
     parser.add_argument("--schedulers", default="round-robin,max-aoi,innovation")
+    parser.add_argument("--load", type=int, default=100, help="devices per block, about")
     options = parser.parse_args()
     started = time.perf_counter()
     for _ in itertools.islice(block_fading(0, 1000), 1000):
@@ -48,7 +49,7 @@ def main() -> None:
             protocol = dataclasses.replace(settings.protocol, steps=steps)
             access = Access(
                 scheduler=scheduler,
-                blocks=max(1, devices // 100),
+                blocks=max(1, devices // options.load),
                 margin_db=10.0,
                 k_factor_db=-math.inf,
                 coherence_slots=1.0,

@@ -146,7 +146,8 @@ def schedulers_figure(rows: Sequence[Mapping[str, Any]], *, title: str = "") -> 
                     if (row["method"], row["scheduler"]) == (method, scheduler)
                 ]
                 _bars(axes, scheduler, _curves(mine)[method], SCHEDULER_STYLES[scheduler])
-            axes.set_ylim(bottom=0)
+            most = max(row["devices_ci95"][1] for row in rows if row["method"] == method)
+            axes.set_ylim(0, 1.1 * most or 1)  # the highest interval ends below the frame
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
             axes.set_ylabel("Devices")
             axes.annotate(
