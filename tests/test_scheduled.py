@@ -218,7 +218,7 @@ def test_gains_name_the_best_rivals():
 
 def test_a_report_shows_every_scheduler(stage):
     result = stage("hold-true", schedulers=["round-robin", "max-aoi"], snr_db="20")
-    shown = "".join(report.scale_section(result))
+    shown = "".join(report.scale_section(result, {}))
     assert "hold-true, max-aoi" in shown and "over hold-true, round-robin at 20 dB" in shown
 
 
