@@ -22,8 +22,12 @@ from hjepa_cli.settings import load_settings
 
 fuzz = load("fuzz")
 CASES = {
-    "Checkpoint": 280, "Dataset": 230, "Curves": 180,
-    "Records": 110, "Progress": 80, "Toml": 105,
+    "Checkpoint": 280,
+    "Dataset": 230,
+    "Curves": 180,
+    "Records": 110,
+    "Progress": 80,
+    "Toml": 105,
 }
 MODELS = 15
 
