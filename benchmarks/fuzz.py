@@ -275,6 +275,7 @@ class Progress(Target):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.run = runs.Run.create("eval", self.path, load_settings().as_dict())
+        self.run.close()  # nobody else works there
         self.run.resumed = True
         self.file = self.path / progress.PROGRESS_FILE
         for _ in self._start().steps("a", 2, *self._parts()):
