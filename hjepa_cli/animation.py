@@ -6,8 +6,9 @@ strip with one column per slot: a full bar is a packet that arrived, a tick one 
 """
 
 import contextlib
-import os
+import io
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -169,26 +170,21 @@ def check_target(path: Path) -> None:
 
 def write(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
     """Write .gif or .mp4, atomically. Raises StorageError."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        save = _write_gif if path.suffix == ".gif" else _write_mp4
-        save(pictures, temporary, fps, tick)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise files.storage_error(path, error) from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    encode = _gif if path.suffix == ".gif" else _mp4
+    files.write_bytes(path, encode(pictures, fps, tick))
 
 
-def _write_gif(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
+def _gif(pictures: Pictures, fps: int, tick: Callable[[], None]) -> bytes:
     palette = _palette(pictures.draw(pictures.steps[-1]))  # one for all: no flicker
     shots = []
     for picture in pictures:
         shots.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
         tick()
+    encoded = io.BytesIO()
     shots[0].save(
-        path, "GIF", save_all=True, append_images=shots[1:], duration=round(1000 / fps), loop=0
+        encoded, "GIF", save_all=True, append_images=shots[1:], duration=round(1000 / fps), loop=0
     )
+    return encoded.getvalue()
 
 
 def _palette(picture: Image.Image) -> Image.Image:
@@ -200,22 +196,23 @@ def _palette(picture: Image.Image) -> Image.Image:
     return palette
 
 
-def _write_mp4(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
+def _mp4(pictures: Pictures, fps: int, tick: Callable[[], None]) -> bytes:
     import imageio_ffmpeg
 
     width, height = pictures.size_px
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps)]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *raw, "-i", "-"]
-    command += ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as encoder:
-        assert encoder.stdin is not None and encoder.stderr is not None
-        with contextlib.suppress(BrokenPipeError):  # it says below why it has gone
-            for picture in pictures:
-                encoder.stdin.write(picture.tobytes())
-                tick()
-            encoder.stdin.close()
-        complaint = encoder.stderr.read().decode(errors="replace")
-    if encoder.returncode:
-        raise StorageError(
-            f"ffmpeg could not write {path.name}: {complaint}", hint="--out FILE.gif"
-        )
+    with tempfile.TemporaryDirectory() as folder:  # ffmpeg seeks in what it writes
+        film = Path(folder, "film.mp4")
+        command += ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", str(film)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as encoder:
+            assert encoder.stdin is not None and encoder.stderr is not None
+            with contextlib.suppress(BrokenPipeError):  # it says below why it has gone
+                for picture in pictures:
+                    encoder.stdin.write(picture.tobytes())
+                    tick()
+                encoder.stdin.close()
+            complaint = encoder.stderr.read().decode(errors="replace")
+        if encoder.returncode:
+            raise StorageError(f"ffmpeg failed: {complaint}", hint="--out FILE.gif")
+        return film.read_bytes()

@@ -4,6 +4,7 @@ The run remembers its settings (``config.toml``) and what it was given (``enviro
 """
 
 import dataclasses
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.storage.datasets import MANIFEST, load_dataset
 from hjepa_cli.storage.runs import CONFIG, RESULT, read_environment, version_of
-from hjepa_cli.storage.shards import LOG, read_task, remove_log
+from hjepa_cli.storage.shards import LOG, remove_log
 
 STAGES = ("train-encoder", "train-hierarchy", "eval", "scale", "reproduce")
 
@@ -132,17 +133,18 @@ def recall(directory: Path, screen: Screen) -> tuple[str, Settings, dict[str, An
     if not directory.is_dir():
         raise MissingInputError(f"run {directory} does not exist", hint="ls runs/*")
     if (directory / LOG).exists():
-        task = read_task(directory)
-        flags = {key: value for key, value in task.items() if key != "preset"}
-        for section in [key for key, value in flags.items() if isinstance(value, dict)]:
-            flags |= {f"{section}.{key}": value for key, value in flags.pop(section).items()}
-        settings = load_settings(_preset(task, directory), None, flags)
-        check_settings(settings)
-        return "collect", settings, {}
+        from hjepa_cli.stages.collect import recorded_settings
+
+        return "collect", recorded_settings(directory), {}
     found = read_environment(directory)
     if found["stage"] not in STAGES:
         raise DataError(
             f"{directory} holds a run of '{found['stage']}', which this hjepa does not know"
+        )
+    if not (directory / CONFIG).exists():
+        raise MissingInputError(
+            f"{directory} was stopped before its settings were kept: there is nothing to continue",
+            hint=_begun_by(found),
         )
     made_by = version_of(found) or __version__
     try:
@@ -165,6 +167,14 @@ def _preset(recorded: dict[str, Any], directory: Path) -> str | None:
     if preset is not None and not isinstance(preset, str):
         raise DataError(f"{directory} is of preset {preset!r}")
     return preset
+
+
+def _begun_by(found: dict[str, Any]) -> str | None:
+    """The command that began the run, as far as it was kept."""
+    command = found.get("command")
+    if not isinstance(command, list) or not all(isinstance(word, str) for word in command):
+        return None
+    return shlex.join(["hjepa", *command[1:]])
 
 
 def _path(inputs: dict[str, Any], name: str) -> Path | None:
