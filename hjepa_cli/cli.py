@@ -321,7 +321,7 @@ def evaluate(
             "plant": plant,
             "seed": seed,
             "device": device,
-            "methods": options.split_names(methods) or (COMPARED if figure else None),
+            "methods": COMPARED if figure and methods is None else options.split_names(methods),
             "protocol.process_noise": process_noise,
             "protocol.plant_spread": plant_spread,
             "protocol.payload": payload,
