@@ -18,10 +18,10 @@ from torch import Tensor
 
 from hjepa_cli.command import resolve
 from hjepa_cli.core import cell_loop
+from hjepa_cli.core.conditions import actual_plant
 from hjepa_cli.core.loop import Draws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant
 from hjepa_cli.core.uplink import Access
 from hjepa_cli.errors import UsageError
 from hjepa_cli.screen import Screen
@@ -132,7 +132,7 @@ def drive(
         forces.append(forces_n.copy())
 
     outcome = simulate(
-        plant(chosen.plant),
+        actual_plant(chosen),
         draws,
         (schedule if how.uses_link else np.ones_like(schedule))[None],
         how.controller(devices),
@@ -166,7 +166,7 @@ def simulate_cell(
         scheduler: who gets them.
         model: of :func:`load_model`.
         preset, settings: plant, seed and protocol (its steps K); of ``radio``, the power margin,
-            how long fades last and the share of transmissions that fail.
+            how long fades last and the share of transmissions that fail, none of which is repeated.
 
     Returns:
         ``score`` [N] (share of steps inside the band), ``cost`` [N] (mean capped quadratic cost),
@@ -176,7 +176,7 @@ def simulate_cell(
         UsageError: unknown method or scheduler, or more blocks than devices.
     """
     chosen = _settings(preset, None, settings)
-    kind, protocol, radio = plant(chosen.plant), chosen.protocol, chosen.radio
+    kind, protocol, radio = actual_plant(chosen), chosen.protocol, chosen.radio
     how = build_method(method, chosen, model)
     access = Access(
         scheduler=scheduler,
@@ -184,7 +184,7 @@ def simulate_cell(
         margin_db=radio.power_margin_db,
         k_factor_db=-math.inf,
         coherence_slots=radio.coherence_slots,
-        block_error=radio.block_error,
+        round_errors=(radio.block_error,),
         growth=cell_loop.measure_growth(kind, protocol, chosen.seed + CALIBRATION_SEED, how),
         seed=chosen.seed,
     )

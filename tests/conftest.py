@@ -1,10 +1,15 @@
 """Settings shared by all tests: the same examples on every machine, and no window system."""
 
 import os
+import signal
 
 from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+# A shell's background jobs ignore Ctrl-C, and so would every process that a test starts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Derandomised: a failure on one machine is a failure on all. No deadline: machines are shared.
 settings.register_profile("hjepa", derandomize=True, deadline=None, max_examples=50, database=None)

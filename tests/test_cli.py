@@ -159,6 +159,7 @@ def test_defaults_are_in_the_presets_and_not_in_the_signatures():
                 "debug",
                 "remeasure",
                 "verify",
+                "figure",
             )
             assert parameter.default is (False if switch else None), f"{name} {parameter.name}"
 
