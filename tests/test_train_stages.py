@@ -216,6 +216,17 @@ def test_other_strides_share_what_depends_on_none(workplace: Path) -> None:
     assert shared("other-seed", hierarchy__h=2, hierarchy__m=1, seed=1) == [False] * 3
 
 
+def test_the_actor_s_error_is_measured_without_dropout(workplace: Path) -> None:
+    """Two models that share an actor tell the same error, whatever random numbers are left."""
+    train(workplace, "told", actor__dropout=0.5)
+    train(workplace, "told-again", encoder="told", actor__dropout=0.5, hierarchy__coarse_steps=3)
+    first, second = (
+        load_checkpoint(workplace / name / "model.safetensors").metadata["health"]
+        for name in ("told", "told-again")
+    )
+    assert first["actor_nrmse"] == second["actor_nrmse"]
+
+
 def test_a_rejected_encoder_is_kept_apart_and_can_be_used(workplace: Path) -> None:
     rejected = workplace / "gated" / "rejected.safetensors"
     result = train_hierarchy.run(

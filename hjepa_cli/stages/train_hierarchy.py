@@ -276,7 +276,9 @@ def examine(
     """Held-out health of what this stage trained: the actor and the coarsest level."""
     z = embed(modules["encoder"], test, settings)
     coarsest = modules["high" if "high" in modules else "flat"]
-    actor, coarsest = copy.deepcopy(modules["actor"]).cpu(), copy.deepcopy(coarsest).cpu()
+    actor, coarsest = (
+        copy.deepcopy(network).cpu().eval() for network in (modules["actor"], coarsest)
+    )
     start, end = z[:, :-h].flatten(0, 1), z[:, h:].flatten(0, 1)
     return {
         "actor_nrmse": health.nrmse(actor.act(z), test.labels),
