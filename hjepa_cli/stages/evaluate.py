@@ -270,7 +270,7 @@ def _measure(
     """Entries of ``eval --json``, one method after the other."""
     settings, protocol = subject.settings, subject.settings.protocol
     states, teacher_n = _clean_rollouts(subject)
-    limit_n = plant(settings.plant).force_limit_n
+    limit_n, every_step = plant(settings.plant).force_limit_n, dict[str, Floats]()
     with _runner(subject) as runner:
         with _ticking(screen, "eval teacher", _device_steps(settings)) as tick:
             bench = Bench(protocol, settings.seed, runner, tick)
@@ -283,14 +283,16 @@ def _measure(
             method = build_method(name, settings, subject.model)
             with _ticking(screen, f"eval {name}", _usual_device_steps(settings)) as tick:
                 bench.tick = tick
-                errors, every_step = (
-                    measure(method, states, teacher_n, limit_n, protocol.horizon)
-                    for measure in (control_errors, errors_at_every_step)
-                )
+                rollouts = (states, teacher_n, limit_n, protocol.horizon)
+                if method.family not in every_step:  # with every packet a family plays the same
+                    every_step[method.family] = errors_at_every_step(method, *rollouts)
+                errors = control_errors(method, *rollouts)
                 yield (
                     name,
                     {
-                        **control_entry(errors, every_step, protocol.bootstrap, settings.seed),
+                        **control_entry(
+                            errors, every_step[method.family], protocol.bootstrap, settings.seed
+                        ),
                         **bench.entry(method),
                         "teacher_score": bench.teacher_score,
                         "seed": settings.seed,
