@@ -4,8 +4,9 @@
     python benchmarks/study.py seeds --seeds 0,1,2,3,4 --out study
 
 A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and rows, each a name and
-the settings in which it differs from the preset. A row without settings of the training stages and
-with a ``checkpoint`` only measures that one.
+the settings in which it differs from the preset. A row with ``strides`` trains these, one with
+``flat`` also single levels of these depths on the same encoder, with the same actor. A row with a
+``checkpoint`` only measures that one.
 
 Everything is kept below ``--out`` in directories named after what they depend on, so rows share
 what they can (one dataset, one encoder), an interrupted study goes on with the same command, and a
@@ -74,34 +75,35 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
         described = json.dumps([preset, sections, seed, *more], sort_keys=True)
         return out / f"{stage}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
 
+    def evaluate(checkpoint: str | Path, methods: list[str], *of: Any) -> dict[str, Any]:
+        named = ("--checkpoint", checkpoint, "--methods", ",".join(methods))
+        document = hjepa("eval", *common, *named, "--out", directory("eval", *of, methods))
+        return dict(document["methods"])
+
     config = out / f"{directory('config').name}.toml"
     config.write_text(as_toml(changes))
     common = ["--preset", preset, "--config", str(config), "--seed", str(seed)]
-    checkpoint: str | Path
     if "checkpoint" in row:
-        checkpoint, health = row["checkpoint"], {}
-    else:
-        data, encoder = directory("collect"), directory("train-encoder")
-        checkpoint = directory("train-hierarchy", row.get("strides"))
-        hjepa("collect", *common, "--out", data)
-        trained = hjepa(
-            *("train-encoder", *common, "--no-gate", "--dataset", data, "--out", encoder)
-        )
-        h, m, l = row.get("strides", (None, None, None))
-        strides = [
-            f"--{name}={value}" for name, value in zip("hml", (h, m, l), strict=True) if value
-        ]
-        checkpoint = directory("train-hierarchy", row.get("strides"))
+        return {"health": {}, "methods": evaluate(row["checkpoint"], methods, row["checkpoint"])}
+    data, encoder = directory("collect"), directory("train-encoder")
+    hjepa("collect", *common, "--out", data)
+    trained = hjepa(*("train-encoder", *common, "--no-gate", "--dataset", data, "--out", encoder))
+
+    def levels(strides: list[int] | None, on: Path) -> Path:
+        of = directory("train-hierarchy", strides)
+        given = zip("hml", strides or (), strict=False)
+        words = [f"--{name}={value}" for name, value in given]
         hjepa(
-            *("train-hierarchy", *common, *strides),
-            *("--dataset", data, "--encoder", encoder, "--out", checkpoint),
+            *("train-hierarchy", *common, *words, "--dataset", data, "--encoder", on, "--out", of)
         )
-        health = trained["health"]
-    evaluated = hjepa(
-        *("eval", *common, "--checkpoint", checkpoint, "--methods", ",".join(methods)),
-        *("--out", directory("eval", row.get("strides"), str(row.get("checkpoint")), methods)),
-    )
-    return {"health": health, "methods": evaluated["methods"]}
+        return of
+
+    strides = row.get("strides")
+    hierarchy = levels(strides, encoder)
+    measured = evaluate(hierarchy, methods, strides)
+    for depth in row.get("flat", ()):
+        measured |= evaluate(levels([depth], hierarchy), [f"ts-jepa-{depth}"], strides)
+    return {"health": trained["health"], "methods": measured}
 
 
 def hjepa(*words: object) -> dict[str, Any]:

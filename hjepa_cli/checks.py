@@ -67,7 +67,7 @@ LARGEST_SEED = 2**63 - 1
 LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
 LARGEST_STRIDE = 10_000
 # Counts that may be 0; all others start at 1.
-ZERO_ALLOWED = ("seed", "encoder.shift_px", "radio.overhead_bits")
+ZERO_ALLOWED = ("seed", "encoder.shift_px", "hierarchy.shifted_copies", "radio.overhead_bits")
 NEGATIVE_ALLOWED = ("encoder.gate_", "radio.power_dbm")  # thresholds of R²; decibels
 POSITIVE = (
     *("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket"),

@@ -120,6 +120,7 @@ class HierarchySettings:
     h: int
     m: int
     l: int
+    shifted_copies: int
     rollout_steps: int
     batch_trajectories: int
     coarse_starts: int

@@ -2,6 +2,7 @@
 start, target and inverse-dynamics sample at once."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -9,6 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hjepa_cli.core.history import frames_seen
+
+Labels = Callable[[Tensor, Tensor, NDArray[np.int64]], Tensor]
+"""Trajectories [B, 1], steps k [B, F], shifts [B, 1] in px → the teacher's actions ÷ force limit
+[B, F, *A] in the states that the shifted pictures show."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +66,7 @@ class FrameWindows:
             its frames. Exact physics as well, as long as nothing leaves the picture: the same
             motion elsewhere on the track.
         mirrored_actions: what mirroring does to actions, a factor for each.
-        labels: the teacher's actions ÷ force limit [N, T, *A], where they are wanted.
+        labels: what the teacher does in shifted pictures, where that is wanted.
         frames_each: κ, of which a device remembers no more than it has seen.
     """
 
@@ -75,7 +80,7 @@ class FrameWindows:
         mirror: bool,
         shift_px: int = 0,
         mirrored_actions: float | tuple[float, ...] = -1.0,
-        labels: Tensor | None = None,
+        labels: Labels | None = None,
         frames_each: int = 2,
     ) -> None:
         self.frames, self.actions = frames, actions
@@ -101,17 +106,21 @@ class FrameWindows:
         rows = trajectories[:, None]
         seen = torch.from_numpy(frames_seen(k.numpy(), self.frames_each))
         frames = self.frames[rows[..., None], seen]
-        labels = None if self.labels is None else self.labels[rows, k]
+        flipped = torch.zeros(len(k), dtype=torch.bool)
         if self.mirror:
             flipped = torch.from_numpy((generator.random(count) < 0.5)[share])
             frames[flipped] = frames[flipped].flip(-2)
             actions[flipped] *= self.mirrored_actions
-            if labels is not None:
-                labels[flipped] *= self.mirrored_actions
+        shifts = np.zeros(len(k), dtype=np.int64)
         if self.shift_px:
-            shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)
-            for window, shift_px in zip(frames, shifts[share], strict=True):
+            shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)[share]
+            for window, shift_px in zip(frames, shifts, strict=True):
                 window.copy_(shift_sideways(window, int(shift_px)))
+        labels = None
+        if self.labels is not None:  # a mirror image moved right is that of one moved left
+            before = np.where(flipped.numpy(), -shifts, shifts)
+            labels = self.labels(rows, k, before[:, None])
+            labels[flipped] *= self.mirrored_actions
         windows = (f"{row} from k = {k[0]}" for row, k in zip(chosen, steps, strict=True))
         return TrajectoryBatch(
             frames.flatten(0, 1),

@@ -80,6 +80,14 @@ class Plant(System):
 
     # What knows the plant in turn is imported late.
 
+    def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
+        """The track looks the same everywhere: only x moves."""
+        from hjepa_cli.core.camera import WIDTH_PX
+
+        moved = np.array(states, float)
+        moved[..., 0] += np.asarray(shift_px) * self.window_m[0] / WIDTH_PX
+        return moved
+
     def advance(self, states: Floats, forces_n: Floats) -> Floats:
         """See :func:`hjepa_cli.core.dynamics.rk4_step`."""
         from hjepa_cli.core.dynamics import rk4_step

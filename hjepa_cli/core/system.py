@@ -167,6 +167,20 @@ class System(abc.ABC):
     def cost(self, states: Floats, forces_n: Floats) -> Floats:
         """Quadratic cost of a step, capped; see :func:`hjepa_cli.core.metrics.stage_cost`."""
 
+    def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
+        """States ``[..., S]`` whose pictures are those of ``states``, moved right by ``[...]`` px.
+
+        Training needs it to move pictures (``shift_px``) and to ask the teacher what it would do
+        there.
+
+        Raises:
+            UsageError: this plant looks different elsewhere, or does not say.
+        """
+        raise UsageError(
+            f"plant {self.name} does not say what moving its picture sideways means",
+            hint="set shift_px = 0 in [encoder], or write System.sideways",
+        )
+
     @property
     def unstable_rate_rad_s(self) -> float:
         """λ, the sum of the unstable poles at rest [rad/s], from the exact equations."""

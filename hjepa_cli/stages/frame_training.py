@@ -16,7 +16,7 @@ from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.training import Optimiser, autocast, resolve_device
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.inputs import RenderedSplit
+from hjepa_cli.stages.inputs import RenderedSplit, labels_of
 from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.runs import Run
 
@@ -103,7 +103,7 @@ class Training:
             mirror=options.mirror == "augment",
             shift_px=options.shift_px,
             mirrored_actions=kind.mirror,
-            labels=self.train.labels,
+            labels=labels_of(self.train, kind),
             frames_each=options.frames,
         )
         stream = generator(settings.seed, STREAM)

@@ -10,14 +10,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hjepa_cli import __version__
+from hjepa_cli.core.batches import Labels, shift_sideways
 from hjepa_cli.core.history import frames_seen
 from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import encode_frames
 from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.core.ranks import ALONE, Ranks
+from hjepa_cli.core.system import System
 from hjepa_cli.core.training import resolve_device
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.screen import Screen
@@ -84,19 +87,45 @@ def embed(
     every: int = 1,
     frames: int = 2,
     mirrored: bool = False,
+    shifts_px: NDArray[np.int64] | None = None,
     advance: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
-    """Frozen embeddings [N, K, D] of k = 0, ``every``, …, from κ frames or their mirror images."""
+    """Frozen embeddings [N, K, D] of k = 0, ``every``, …, from κ frames.
+
+    ``mirrored`` takes the frames' mirror images; each trajectory is then moved right by
+    ``shifts_px`` [N].
+    """
     device = resolve_device(settings.device)
     precision = settings.encoder.precision
     parts = []
     for start in range(0, len(split.frames), CHUNK):
         part = split.slice(start, start + CHUNK)
         seen = part.seen(every, frames=frames, mirrored=mirrored)
+        if shifts_px is not None:
+            by_trajectory = seen.unflatten(0, (len(part.frames), -1))
+            moved = zip(by_trajectory, shifts_px[start : start + CHUNK].tolist(), strict=True)
+            seen = torch.cat([shift_sideways(frames, shift_px) for frames, shift_px in moved])
         z = encode_frames(encoder, seen, device=device, precision=precision)
         parts.append(z.unflatten(0, (len(part.frames), -1)))
         advance(len(part.frames))
     return torch.cat(parts)
+
+
+def labels_of(split: RenderedSplit, kind: System) -> Labels:
+    """The teacher's actions on a split: as recorded, or asked anew where pictures are moved.
+
+    What it returns raises a UsageError for a plant whose pictures cannot be moved.
+    """
+    act = kind.teacher()
+
+    def labels(trajectories: Tensor, k: Tensor, shifts_px: NDArray[np.int64]) -> Tensor:
+        if not shifts_px.any():
+            return split.labels[trajectories, k]
+        states = split.states[trajectories, k].numpy().astype(float)
+        forces_n = act(kind.sideways(states, shifts_px))
+        return torch.from_numpy(forces_n / kind.force_limit_n).to(split.labels.dtype)
+
+    return labels
 
 
 def check_stride(h: int, steps: int) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.random import Generator
 from torch import Tensor, nn
@@ -39,6 +40,7 @@ from hjepa_cli.stages.inputs import (
     RenderedSplit,
     check_stride,
     embed,
+    labels_of,
     open_dataset,
     render,
     training_run,
@@ -56,6 +58,7 @@ SHARED = ("actor", "flat")  # networks that depend on no stride
 FLAT_SETTINGS = (  # all that the training of the flat baseline depends on
     *("rollout_steps", "batch_trajectories", "flat_starts", "flat_steps"),
     *("optimizer", "schedule", "gradient_clip", "coarse_learning_rate", "coarse_weight_decay"),
+    "shifted_copies",
 )
 ARCHITECTURE = ("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual")
 
@@ -228,7 +231,7 @@ def trained_alike(source: Checkpoint, data: Dataset, settings: Settings) -> bool
     return (
         (metadata["dataset"], metadata["seed"]) == (data.digest, settings.seed)
         and theirs["actor"] == mine["actor"]
-        and theirs["encoder"]["precision"] == mine["encoder"]["precision"]
+        and all(theirs["encoder"][key] == mine["encoder"][key] for key in ("precision", "shift_px"))
         and all(theirs["hierarchy"].get(key) == mine["hierarchy"][key] for key in FLAT_SETTINGS)
     )
 
@@ -255,17 +258,37 @@ def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, A
 def embed_all(
     encoder: nn.Module, train: RenderedSplit, settings: Settings, screen: Screen, *, flip: bool
 ) -> list[tuple[EmbeddedTrajectories, Tensor]]:
-    """Embeddings and labels [N, T, *A] of the training frames, with ``flip`` mirrored ones too."""
-    device, mirror = resolve_device(settings.device), torch.tensor(plant(settings.plant).mirror)
-    views = (False, True) if flip else (False,)
-    seen = []
-    with screen.progress("encode", len(views) * len(train.frames), "trajectories") as bar:
-        for mirrored in views:
-            z = embed(encoder, train, settings, mirrored=mirrored, advance=bar.advance)
-            actions, labels = (
-                mirror * forces if mirrored else forces for forces in (train.actions, train.labels)
+    """Embeddings and labels [N, T, *A] of the training pictures and of shifted copies of them.
+
+    In a copy every trajectory is moved sideways by up to ``encoder.shift_px``, and the labels are
+    what the teacher does there. With ``flip`` all of these are there in the mirror too.
+    """
+    device, kind = resolve_device(settings.device), plant(settings.plant)
+    farthest, count = settings.encoder.shift_px, len(train.frames)
+    copies = settings.hierarchy.shifted_copies if farthest else 0
+    drawn = generator(settings.seed, STREAM, 0).integers(-farthest, farthest + 1, (copies, count))
+    mirror, teach, seen = torch.tensor(kind.mirror), labels_of(train, kind), []
+    every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
+    views = [
+        (mirrored, shifts_px)
+        for mirrored in ((False, True) if flip else (False,))
+        for shifts_px in (np.zeros(count, dtype=np.int64), *drawn)
+    ]
+    with screen.progress("encode", len(views) * count, "trajectories") as bar:
+        for mirrored, shifts_px in views:
+            side = mirror if mirrored else torch.ones_like(mirror)
+            z = embed(
+                encoder,
+                train,
+                settings,
+                mirrored=mirrored,
+                shifts_px=shifts_px if shifts_px.any() else None,
+                advance=bar.advance,
             )
-            seen.append((EmbeddedTrajectories(z.to(device), actions.to(device)), labels))
+            # A mirror image moved right is that of a picture moved left.
+            labels = side * teach(*every, (-shifts_px if mirrored else shifts_px)[:, None])
+            data = EmbeddedTrajectories(z.to(device), (side * train.actions).to(device))
+            seen.append((data, labels))
     return seen
 
 

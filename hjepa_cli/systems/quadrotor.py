@@ -81,6 +81,12 @@ class Quadrotor(System):
         """The linear quadratic regulator of hovering, clipped."""
         return _teacher(self)
 
+    def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
+        """The air looks the same everywhere: only x moves."""
+        moved = np.array(states, float)
+        moved[..., 0] += np.asarray(shift_px) * self.window_m / WIDTH_PX
+        return moved
+
     def camera(self) -> "Camera":
         """See :class:`Camera`."""
         return Camera(self)
