@@ -69,33 +69,35 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
     changes = {key: value for key, value in row.items() if isinstance(value, dict)}
     preset = row.get("preset", "default")
 
+    def sections(stage: str) -> dict[str, dict[str, Any]]:
+        return {name: changes.get(name, {}) for name in SECTIONS_OF.get(stage, changes)}
+
     def directory(stage: str, *more: Any) -> Path:
-        sections = {name: changes.get(name, {}) for name in SECTIONS_OF.get(stage, changes)}
         # A preset other than the default may change any section.
-        described = json.dumps([preset, sections, seed, *more], sort_keys=True)
+        described = json.dumps([preset, sections(stage), seed, *more], sort_keys=True)
         return out / f"{stage}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
+
+    def run(stage: str, *words: object) -> dict[str, Any]:
+        config = out / f"{directory(stage).name}.toml"
+        config.write_text(as_toml(sections(stage)))
+        common = ("--preset", preset, "--config", config, "--seed", seed)
+        return hjepa(stage, *common, *words)
 
     def evaluate(checkpoint: str | Path, methods: list[str], *of: Any) -> dict[str, Any]:
         named = ("--checkpoint", checkpoint, "--methods", ",".join(methods))
-        document = hjepa("eval", *common, *named, "--out", directory("eval", *of, methods))
-        return dict(document["methods"])
+        return dict(run("eval", *named, "--out", directory("eval", *of, methods))["methods"])
 
-    config = out / f"{directory('config').name}.toml"
-    config.write_text(as_toml(changes))
-    common = ["--preset", preset, "--config", str(config), "--seed", str(seed)]
     if "checkpoint" in row:
         return {"health": {}, "methods": evaluate(row["checkpoint"], methods, row["checkpoint"])}
     data, encoder = directory("collect"), directory("train-encoder")
-    hjepa("collect", *common, "--out", data)
-    trained = hjepa(*("train-encoder", *common, "--no-gate", "--dataset", data, "--out", encoder))
+    run("collect", "--out", data)
+    trained = run("train-encoder", "--no-gate", "--dataset", data, "--out", encoder)
 
     def levels(strides: list[int] | None, on: Path) -> Path:
         of = directory("train-hierarchy", strides)
         given = zip("hml", strides or (), strict=False)
         words = [f"--{name}={value}" for name, value in given]
-        hjepa(
-            *("train-hierarchy", *common, *words, "--dataset", data, "--encoder", on, "--out", of)
-        )
+        run("train-hierarchy", *words, "--dataset", data, "--encoder", on, "--out", of)
         return of
 
     strides = row.get("strides")

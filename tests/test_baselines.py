@@ -105,7 +105,7 @@ def test_windows_carry_the_frames_and_labels_of_their_steps(frames: int) -> None
         window_frames=3,
         stride=4,
         mirror=True,
-        labels=labels,
+        labels=lambda rows, k, shifts_px: labels[rows, k],
         frames_each=frames,
     )
     batch = windows.draw(40, np.random.default_rng(0))

@@ -124,6 +124,7 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
         {"name": "plain"},
         {"name": "long", "encoder": {"steps": 7}},
         {"name": "other strides", "strides": [16, 4, 1]},
+        {"name": "measured otherwise", "protocol": {"curve_devices": 8}, "flat": [2, 3]},
         {"name": "fixed", "checkpoint": "desktop-h4m2l1", "protocol": {"plant_spread": 0.2}},
     ]
     for row in rows:
@@ -133,18 +134,22 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
         return [words[words.index(flag) + 1] for words in ran if words[0] == stage]
 
     assert len(set(used("collect", "--out"))) == 1
-    assert used("train-encoder", "--out")[0] == used("train-encoder", "--out")[2]
-    assert len(set(used("train-encoder", "--out"))) == 2
-    assert used("train-hierarchy", "--encoder") == used("train-encoder", "--out")
-    assert len(set(used("train-hierarchy", "--out"))) == 3
-    assert ["--h=16" in words for words in ran if words[0] == "train-hierarchy"] == [
-        False,
-        False,
-        True,
+    encoders, levels = used("train-encoder", "--out"), used("train-hierarchy", "--out")
+    assert encoders == [encoders[0], encoders[1], encoders[0], encoders[0]]
+    assert encoders[0] != encoders[1]
+    assert len(set(levels)) == 5 and levels[3] == levels[0]
+    assert used("train-hierarchy", "--encoder") == [*encoders, levels[0], levels[0]]
+    strides = [[word for word in words if word.startswith("--h=")] for words in ran]
+    assert [h for words, h in zip(ran, strides, strict=True) if words[0] == "train-hierarchy"] == [
+        *([], [], ["--h=16"], []),
+        *(["--h=2"], ["--h=3"]),
     ]
-    assert used("eval", "--checkpoint")[:3] == used("train-hierarchy", "--out")
-    assert used("eval", "--checkpoint")[3] == "desktop-h4m2l1"
-    assert len(set(used("eval", "--out"))) == 4
+    assert used("eval", "--checkpoint") == [*levels, "desktop-h4m2l1"]
+    assert used("eval", "--methods") == [*["hjepa"] * 4, "ts-jepa-2", "ts-jepa-3", "hjepa"]
+    assert len(set(used("eval", "--out"))) == 7
+    # What is only measured otherwise is not trained again: no stage sees the settings of another.
+    configs = {words[0]: Path(words[words.index("--config") + 1]) for words in ran[-8:]}
+    assert "curve_devices" not in configs["train-hierarchy"].read_text()
     assert {words[words.index("--seed") + 1] for words in ran} == {"3"}
 
 

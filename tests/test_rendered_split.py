@@ -17,7 +17,7 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.core.sensors import embedding_sensor
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
-from hjepa_cli.stages.inputs import CHUNK, RenderedSplit, embed, render
+from hjepa_cli.stages.inputs import CHUNK, RenderedSplit, embed, labels_of, render
 from hjepa_cli.stages.train_encoder import standardisation_sample
 from hjepa_cli.stages.train_hierarchy import embed_all
 from hjepa_cli.storage.datasets import Trajectories
@@ -144,6 +144,85 @@ def test_shifted_windows_are_what_the_camera_sees_elsewhere_on_the_track(
     assert len(seen) >= 4
 
 
+@pytest.mark.parametrize("mirror", [False, True])
+def test_labels_are_what_the_teacher_does_where_the_window_shows(
+    recorded: Trajectories, mirror: bool
+) -> None:
+    """The state that a moved window shows is found through the camera, then the teacher asked."""
+    in_view = recorded.states * np.array([0.2, 1, 0.5, 1], np.float32)
+    split = render(dataclasses.replace(recorded, states=in_view), "desktop", QUIET)
+    kind = plant("desktop")
+    windows = FrameWindows(
+        split.frames,
+        split.actions,
+        window_frames=2,
+        stride=3,
+        mirror=mirror,
+        shift_px=2,
+        labels=labels_of(split, kind),
+    )
+    batch = windows.draw(16, np.random.default_rng(2))
+    assert batch.labels is not None
+    seen = set()
+    for window, told in zip(
+        batch.frames.unflatten(0, (16, 2)), batch.labels.unflatten(0, (16, 2)), strict=True
+    ):
+        found = []
+        for sign in (1, -1):
+            for shift_px in range(-2, 3):
+                states = sign * in_view.astype(float)
+                states[..., 0] += shift_px * kind.window_m[0] / 128
+                now = states[:, 1:].reshape(-1, 4)
+                shown = pictures(now)
+                found += [
+                    (sign, shift_px, now[[i, i + 3]])
+                    for i in range(len(now) - 3)
+                    if alike(shown[i], window[0, -1]) and alike(shown[i + 3], window[1, -1])
+                ]
+        ((sign, shift_px, states),) = found
+        np.testing.assert_allclose(told * LIMIT_N, kind.teacher()(states), atol=1e-4)
+        seen.add((sign, shift_px))
+    assert len({shift_px for _, shift_px in seen}) >= 4
+    assert {sign for sign, _ in seen} == ({1, -1} if mirror else {1})
+
+
+def test_shifted_copies_are_embedded_and_labelled_where_they_are(recorded: Trajectories) -> None:
+    """An encoder that keeps the present picture shows what was embedded."""
+    in_view = recorded.states * np.array([0.2, 1, 0.5, 1], np.float32)
+    split = render(dataclasses.replace(recorded, states=in_view), "desktop", QUIET)
+    split = dataclasses.replace(
+        split, labels=torch.from_numpy(plant("desktop").teacher()(in_view[:, 1:]) / LIMIT_N)
+    )
+    settings = load_settings(
+        flags={"device": "cpu", "hierarchy.shifted_copies": 3, "encoder.shift_px": 3}
+    )
+
+    class Last(nn.Module):
+        def forward(self, frames: Tensor) -> Tensor:
+            return frames[:, -1].flatten(1).float()
+
+    seen = embed_all(Last(), split, settings, QUIET, flip=True)
+    assert len(seen) == 2 * (1 + 3)
+    shifts = set()
+    for view, (data, labels) in enumerate(seen):
+        sign = 1 if view < 4 else -1
+        assert torch.equal(data.actions, sign * split.actions)
+        for row in range(COUNT):
+            shown = data.z[row].reshape(STEPS, 64, 128, 3)
+            found = []
+            for shift_px in range(-3, 4):
+                states = sign * in_view[row, 1:].astype(float)
+                states[:, 0] += shift_px * plant("desktop").window_m[0] / 128
+                if alike(pictures(states), shown):
+                    found.append((shift_px, states))
+            ((shift_px, states),) = found
+            expected = plant("desktop").teacher()(states) / LIMIT_N
+            np.testing.assert_allclose(labels[row], expected, atol=1e-5)
+            assert view % 4 or shift_px == 0  # the first view is the recording itself
+            shifts.add(shift_px)
+    assert len(shifts) >= 4
+
+
 def test_the_closed_loop_encodes_the_same_pairs(
     recorded: Trajectories, split: RenderedSplit
 ) -> None:
@@ -203,7 +282,7 @@ def test_embeddings_keep_trajectories_and_steps_apart(every: int, mirrored: bool
 
 def test_mirror_images_come_with_negated_actions_and_labels() -> None:
     split = painted(4, 10)
-    settings = load_settings(flags={"device": "cpu"})
+    settings = load_settings(flags={"device": "cpu", "hierarchy.shifted_copies": 0})
     (plain, labels), (mirrored, mirrored_labels) = embed_all(
         Reader(), split, settings, QUIET, flip=True
     )

@@ -19,6 +19,7 @@ from hjepa_cli.core.loop import Draws, every_step, simulate
 from hjepa_cli.core.methods import true_state_method
 from hjepa_cli.core.metrics import COST_CAP
 from hjepa_cli.core.plant import PLANTS, CartPole, plant, plant_of
+from hjepa_cli.core.system import System
 from hjepa_cli.errors import UsageError
 from hjepa_cli.settings import PRESETS, load_settings
 
@@ -119,6 +120,20 @@ def test_the_mirror_is_exact_physics(name):
     )
     frames, seen = system.camera().render(states), system.camera().render(states * sign)
     assert np.abs(frames[:, :, ::-1].astype(int) - seen).max() <= 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sideways_is_where_the_moved_picture_was_taken(name):
+    system, camera = plant(name), plant(name).camera()
+    states = some(system, 6)[0]
+    shifts_px = np.array([3, -2, 0, 1, 5, -4])
+    moved = camera.render(system.sideways(states, shifts_px))
+    for frame, shift_px, there in zip(camera.render(states), shifts_px, moved, strict=True):
+        inside = slice(max(shift_px, 0), 128 + min(shift_px, 0))
+        shifted = np.roll(frame, shift_px, axis=1)
+        assert np.abs(shifted[:, inside].astype(int) - there[:, inside]).max() <= 1
+    with pytest.raises(UsageError, match=f"plant {name} does not say what moving its picture"):
+        System.sideways(system, states, shifts_px)
 
 
 @pytest.mark.parametrize("name", NAMES)
