@@ -4,9 +4,9 @@
     python benchmarks/study.py seeds --seeds 0,1,2,3,4 --out study
 
 A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and rows, each a name and
-the settings in which it differs from the preset. A row with ``strides`` trains these, one with
-``flat`` also single levels of these depths on the same encoder, with the same actor. A row with a
-``checkpoint`` only measures that one.
+the settings in which it differs from the preset and from what all rows have in ``common``. A row
+with ``strides`` trains these, one with ``flat`` also single levels of these depths on the same
+encoder, with the same actor. A row with a ``checkpoint`` only measures that one.
 
 Everything is kept below ``--out`` in directories named after what they depend on, so rows share
 what they can (one dataset, one encoder), an interrupted study goes on with the same command, and a
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--rows", help="only these rows, by name, separated by ;")
     arguments = parser.parse_args()
     study = tomllib.loads((STUDIES / f"{arguments.study}.toml").read_text())
-    rows, methods = study["row"], study["methods"]
+    rows, methods = rows_of(study), study["methods"]
     if arguments.rows:
         wanted = [name.strip() for name in arguments.rows.split(";")]
         unknown = set(wanted) - {row["name"] for row in rows}
@@ -62,6 +62,15 @@ def main() -> None:
             measured.setdefault(row["name"], {})[seed] = result
             write(measured, arguments.out / arguments.study)
     print((arguments.out / f"{arguments.study}.md").read_text())
+
+
+def rows_of(study: dict[str, Any]) -> list[dict[str, Any]]:
+    """A study's rows, each with the settings that they have in common where it has no others."""
+    common = study.get("common", {})
+    return [
+        row | {section: values | row.get(section, {}) for section, values in common.items()}
+        for row in study["row"]
+    ]
 
 
 def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> dict[str, Any]:

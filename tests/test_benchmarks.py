@@ -92,11 +92,12 @@ def test_every_row_of_a_study_is_a_recipe_with_a_name_of_its_own(
     path: Path, tmp_path: Path
 ) -> None:
     study, as_toml = tomllib.loads(path.read_text()), load("study").as_toml
-    assert set(study) == {"methods", "row"} and set(study["methods"]) <= set(METHODS)
-    names = [row["name"] for row in study["row"]]
+    assert set(study) - {"common"} == {"methods", "row"} and set(study["methods"]) <= set(METHODS)
+    rows = load("study").rows_of(study)
+    names = [row["name"] for row in rows]
     assert len(set(names)) == len(names)
     recipes = []
-    for row in study["row"]:
+    for row in rows:
         sections = {key: value for key, value in row.items() if isinstance(value, dict)}
         config = tmp_path / "config.toml"
         config.write_text(as_toml(sections))
@@ -108,6 +109,20 @@ def test_every_row_of_a_study_is_a_recipe_with_a_name_of_its_own(
                 assert getattr(getattr(settings, section), key) == value
         recipes.append((settings, *row.get("strides", ())))
     assert len(set(recipes)) == len(recipes)
+
+
+def test_rows_have_what_is_common_unless_they_say_otherwise() -> None:
+    common = {"protocol": {"bracket": 0.1, "steps": 9}, "hierarchy": {"flat_steps": 1}}
+    rows = [{"name": "a"}, {"name": "b", "strides": [8, 4, 2], "protocol": {"steps": 5}}]
+    plain, other = load("study").rows_of({"methods": [], "common": common, "row": rows})
+    assert plain == {"name": "a"} | common
+    assert other == {
+        "name": "b",
+        "strides": [8, 4, 2],
+        "protocol": {"bracket": 0.1, "steps": 5},
+        "hierarchy": {"flat_steps": 1},
+    }
+    assert load("study").rows_of({"methods": [], "row": rows}) == rows
 
 
 def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
