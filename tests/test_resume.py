@@ -529,7 +529,7 @@ def test_the_levels_name_their_batches_too(
     *_, drawn, again = seen
     assert drawn == again and len(seen) == loops[level] + 2
     listed = ", ".join(map(str, drawn))
-    named = f"of 4 (mirror images, if any, last) the trajectories {listed})"
+    named = f"of 20 (shifted and mirrored copies last) the trajectories {listed})"
     assert caught.value.message.endswith(named)
     assert (tmp_path / "run" / PROGRESS_FILE).exists() == (level != "high")
 

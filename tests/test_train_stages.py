@@ -255,8 +255,13 @@ def test_frames_are_flipped_for_encoders_that_were_trained_so(workplace: Path, m
     symmetric = train(workplace, "plain")
     flipped = train(workplace, "mirrored", "flipped-encoder")
     (plain_z, plain), (both_z, both) = seen
-    assert len(plain) == 600 and torch.equal(both, torch.cat([plain, -plain]))
-    assert len(plain_z) == 600 and len(both_z) == 1200
+    recorded, views = 600, 1 + settings().hierarchy.shifted_copies
+    assert len(plain_z) == len(plain) == views * recorded
+    assert len(both_z) == len(both) == 2 * len(plain)
+    mirrored = both[len(plain) :]
+    assert torch.equal(both[: len(plain)], plain)  # then the same places in the mirror
+    assert torch.equal(mirrored[:recorded], -plain[:recorded])
+    assert not torch.equal(mirrored, -plain)
     modes = [model.architecture["mirror"] for model in (symmetric, flipped)]
     assert modes == ["exact", "augment"]
 

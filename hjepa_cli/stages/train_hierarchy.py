@@ -400,7 +400,9 @@ def name_batch(
     """The trajectories that a loss drew from ``stream`` when it was in ``state``, for messages."""
     stream.bit_generator.state = state
     chosen = data.choose(count, stream)
-    return name_samples(f"of {len(data.z)} (mirror images, if any, last) the trajectories", chosen)
+    return name_samples(
+        f"of {len(data.z)} (shifted and mirrored copies last) the trajectories", chosen
+    )
 
 
 def join(seen: list[EmbeddedTrajectories]) -> EmbeddedTrajectories:
