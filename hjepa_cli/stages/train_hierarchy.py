@@ -231,7 +231,9 @@ def trained_alike(source: Checkpoint, data: Dataset, settings: Settings) -> bool
     return (
         (metadata["dataset"], metadata["seed"]) == (data.digest, settings.seed)
         and theirs["actor"] == mine["actor"]
-        and all(theirs["encoder"][key] == mine["encoder"][key] for key in ("precision", "shift_px"))
+        and all(
+            theirs["encoder"].get(key) == mine["encoder"][key] for key in ("precision", "shift_px")
+        )
         and all(theirs["hierarchy"].get(key) == mine["hierarchy"][key] for key in FLAT_SETTINGS)
     )
 
