@@ -269,16 +269,18 @@ def embed_all(
     farthest, count = settings.encoder.shift_px, len(train.frames)
     copies = settings.hierarchy.shifted_copies if farthest else 0
     drawn = generator(settings.seed, STREAM, 0).integers(-farthest, farthest + 1, (copies, count))
-    mirror, teach, seen = torch.tensor(kind.mirror), labels_of(train, kind), []
+    mirror, teach = torch.tensor(kind.mirror), labels_of(train, kind)
     every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
-    views = [
-        (mirrored, shifts_px)
-        for mirrored in ((False, True) if flip else (False,))
-        for shifts_px in (np.zeros(count, dtype=np.int64), *drawn)
-    ]
+    views = []
+    for mirrored in (False, True) if flip else (False,):
+        side = mirror if mirrored else torch.ones_like(mirror)
+        for shifts_px in (np.zeros(count, dtype=np.int64), *drawn):
+            # A mirror image moved right is that of a picture moved left.
+            labels = side * teach(*every, (-shifts_px if mirrored else shifts_px)[:, None])
+            views.append((mirrored, side, shifts_px, labels))
+    seen = []
     with screen.progress("encode", len(views) * count, "trajectories") as bar:
-        for mirrored, shifts_px in views:
-            side = mirror if mirrored else torch.ones_like(mirror)
+        for mirrored, side, shifts_px, labels in views:
             z = embed(
                 encoder,
                 train,
@@ -287,8 +289,6 @@ def embed_all(
                 shifts_px=shifts_px if shifts_px.any() else None,
                 advance=bar.advance,
             )
-            # A mirror image moved right is that of a picture moved left.
-            labels = side * teach(*every, (-shifts_px if mirrored else shifts_px)[:, None])
             data = EmbeddedTrajectories(z.to(device), (side * train.actions).to(device))
             seen.append((data, labels))
     return seen
