@@ -25,7 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
+
+from hjepa_cli.core.metrics import student_interval
+from hjepa_cli.stages.compare import differences
 
 STUDIES = Path(__file__).parent / "studies"
 PROBES = ("x", "x_dot", "theta", "theta_dot")
@@ -188,22 +190,24 @@ def compared(measured: dict[str, dict[int, dict[str, Any]]]) -> str:
     for name, by_seed in measured.items():
         if len(by_seed) < 2:
             continue
-        first, *others = next(iter(by_seed.values()))["methods"]
-        results = [result["methods"] for result in by_seed.values()]
-        for other in others:
-            gains = [
-                entry[first]["tolerance_gap_steps"] / entry[other]["tolerance_gap_steps"] - 1
-                for entry in results
-            ]
-            parts = [f"D* {over_seeds([100 * gain for gain in gains], 1)} %"]
-            for window in windows_of(measured):
-                differences = [
-                    entry[first]["nmae_windows"][window] - entry[other]["nmae_windows"][window]
-                    for entry in results
-                ]
-                parts.append(f"NMAE {window} {over_seeds(differences, 5)}")
-            lines.append(f"- {name}: {first} over {other}, n = {len(gains)}: {'; '.join(parts)}")
+        methods = next(iter(by_seed.values()))["methods"]
+        by_method = {
+            method: {seed: result["methods"][method] for seed, result in by_seed.items()}
+            for method in methods
+        }
+        for one in differences(by_method):
+            ratio = one["tolerance_gap_ratio"]
+            parts = [f"D* × {told(ratio, 3)}" if ratio else "D* –"]
+            parts += [f"NMAE {window} {told(by, 5)}" for window, by in one["nmae_windows"].items()]
+            of = f"{one['method']} over {one['over']}, n = {len(by_seed)}"
+            lines.append(f"- {name}: {of}: {'; '.join(parts)}")
     return "\n".join(lines) + "\n" * bool(lines)
+
+
+def told(found: dict[str, Any], decimals: int) -> str:
+    """A mean with its interval."""
+    low, high = found["ci95"]
+    return f"{found['mean']:.{decimals}f} ({low:.{decimals}f} – {high:.{decimals}f})"
 
 
 def over_seeds(values: list[float], decimals: int, alone: list[float] | None = None) -> str:
@@ -213,8 +217,7 @@ def over_seeds(values: list[float], decimals: int, alone: list[float] | None = N
     mean, n = float(np.mean(values)), len(values)
     interval = alone
     if n > 1:
-        half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
-        interval = [mean - half, mean + half]
+        interval = list(student_interval(np.array(values)))
     text = f"{mean:.{decimals}f}"
     if interval is not None:
         text += f" ({interval[0]:.{decimals}f} – {interval[1]:.{decimals}f})"

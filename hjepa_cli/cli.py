@@ -22,7 +22,7 @@ from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, re
 from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
 from hjepa_cli.plan import Plan
 from hjepa_cli.screen import Screen, one_line
-from hjepa_cli.tools import config_app, data_app, report, reproduce, view
+from hjepa_cli.tools import compare, config_app, data_app, report, reproduce, view
 
 PIPELINE, TOOLS = "Pipeline", "Tools"
 STAGES = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
@@ -469,6 +469,7 @@ def resume(
 app.command(rich_help_panel=PIPELINE)(reproduce)
 app.command(rich_help_panel=TOOLS)(view)
 app.command(rich_help_panel=TOOLS)(report)
+app.command(rich_help_panel=TOOLS)(compare)
 
 
 @models_app.callback(invoke_without_command=True)

@@ -475,6 +475,15 @@ RunPaths = Annotated[
         autocompletion=completion.runs,
     ),
 ]
+EvaluationPaths = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Runs of eval, or directories that hold some. Without one: all in runs/eval.",
+        metavar="[RUN]...",
+        show_default=False,
+        autocompletion=completion.runs,
+    ),
+]
 ReportOut = Annotated[
     Path,
     typer.Option(

@@ -224,6 +224,32 @@ def report(
     execute(screen, stage, product="report")
 
 
+def compare(
+    runs: options.EvaluationPaths = None,
+    methods: options.Methods = None,
+    figures: options.FigureDirectory = None,
+    format: options.FigureFormats = "pdf",
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Average evaluations over training seeds: means, 95 % intervals, paired differences."""
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.compare import run
+
+        return run(
+            screen,
+            runs or [],
+            methods=options.split_names(methods),
+            figures=figures,
+            formats=options.split_names(format) or [],
+        )
+
+    execute(screen, stage)
+
+
 def reproduce(
     methods: options.Methods = None,
     out: options.Out = None,

@@ -13,7 +13,7 @@ from test_evaluate import Output, checkpoint, elsewhere, quick_encoder, small, u
 from hjepa_cli.checks import ANCHORS
 from hjepa_cli.core.bench import Bench
 from hjepa_cli.core.model import build_modules, tensors_of
-from hjepa_cli.errors import Interrupted, UsageError
+from hjepa_cli.errors import DataError, Interrupted, UsageError
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import evaluate, resume, scale
 from hjepa_cli.stages.subject import how_to_train, open_subject
@@ -34,6 +34,7 @@ def saved(path: Path, settings: Settings, **architecture: Any) -> Path:
         "architecture": described,
         "plant": settings.plant,
         "settings": settings.as_dict(),
+        "seed": settings.seed,
         "health": {},
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -90,6 +91,17 @@ def test_every_method_finds_its_model(tmp_path: Path, quick_encoder: None) -> No
         **{name: 2064 for name in ("hjepa", "ts-jepa-5", "oracle")},
         **{f"supervised-{kappa}": kappa * 64 * 128 * 24 for kappa in (2, 4)},
     }
+
+
+def test_a_figure_of_models_of_several_seeds_is_refused(quick_encoder: None) -> None:
+    pytest.importorskip("matplotlib")
+    trained("train-hierarchy", load_settings(flags={"encoder.hidden": 16}), kind="hierarchy")
+    trained("train-encoder", of_method("supervised", seed=3))
+    options = small(methods=("zero", "supervised-2", "oracle"), steps=6)
+    with pytest.raises(DataError, match="zero: 0, supervised-2: 3"):
+        evaluate.run(options, Output().screen, figure=True)
+    result = evaluate.run(options, Output().screen)  # a table says which model is whose
+    assert result["training_seeds"] == {"zero": 0, "supervised-2": 3}
 
 
 def test_all_cached_curves_are_found_again(

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
 
 from hjepa_cli.checks import split_late
 from hjepa_cli.core.capacity import (
@@ -21,7 +20,7 @@ from hjepa_cli.core.capacity import (
     late_slots,
     slot_capacity,
 )
-from hjepa_cli.core.metrics import TAILS
+from hjepa_cli.core.metrics import student_interval
 
 Law = Literal["duty", "equal"]
 Row = dict[str, Any]
@@ -177,8 +176,7 @@ def best_flat(rows: Sequence[Row], snr_db: float) -> Row | None:
 def paired_interval(pairs: Sequence[tuple[float, float]]) -> list[float]:
     """Return Student's 95 % interval of the ratio of pairs, taken on the logarithm."""
     logs = np.log([above / below for above, below in pairs])
-    half = stats.t.ppf(TAILS[1], len(logs) - 1) * logs.std(ddof=1) / math.sqrt(len(logs))
-    return [math.exp(logs.mean() - half), math.exp(logs.mean() + half)]
+    return [math.exp(end) for end in student_interval(logs)]
 
 
 def ratio_interval(

@@ -5,10 +5,12 @@ intervals of a bootstrap over devices; the same devices are drawn for a method a
 reference, so what both share (a hard start, a gust) cancels.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from hjepa_cli.core.seeding import generator
 
@@ -62,6 +64,13 @@ def interval(replicates: Floats) -> Floats:
 def mean_interval(values: Floats, weights: Floats) -> Floats:
     """Interval of the mean: values [N, ...], weights [B, N] → [2, ...]."""
     return interval(np.tensordot(weights, values, axes=1))
+
+
+def student_interval(values: Floats) -> Floats:
+    """Student's 95 % interval of the mean over the first axis: [n, ...], n > 1 → [2, ...]."""
+    count = len(values)
+    half = stats.t.ppf(TAILS[1], count - 1) * values.std(axis=0, ddof=1) / math.sqrt(count)
+    return np.asarray(values.mean(axis=0) + np.multiply.outer((-1.0, 1.0), half))
 
 
 def ratio(values: Floats, reference: Floats, weights: Floats | None = None) -> Floats:

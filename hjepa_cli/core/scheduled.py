@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from hjepa_cli.core import metrics
 from hjepa_cli.core.cell_loop import CellOutcome
@@ -131,11 +130,10 @@ def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
     if len(found) == 1:
         return found[0]
     loads = np.array([one.load for one in found])
-    half = stats.t.ppf(metrics.TAILS[1], len(loads) - 1) * loads.std(ddof=1) / math.sqrt(len(loads))
-    mean = float(loads.mean())
+    low, high = map(float, metrics.student_interval(loads))
     return SupportedLoad(
-        load=mean,
-        interval=(max(mean - float(half), 0.0), mean + float(half)),
+        load=float(loads.mean()),
+        interval=(max(low, 0.0), high),
         at_least=any(one.at_least for one in found),
         packets_per_slot=float(np.mean([one.packets_per_slot for one in found])),
         reports_per_slot=float(np.mean([one.reports_per_slot for one in found])),

@@ -14,6 +14,7 @@ from typing import Any
 from hjepa_cli.checks import TRUE_STATE, check_methods, split_late
 from hjepa_cli.core.bench import Bench, control_entry, control_errors, errors_at_every_step
 from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
+from hjepa_cli.core.loop import LOOP_VERSION
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import WINDOWS
 from hjepa_cli.core.plant import plant
@@ -63,7 +64,7 @@ def run(
     Raises:
         UsageError: unknown method.
         MissingInputError: no such checkpoint or dataset, or no matplotlib for ``figure``.
-        DataError: a damaged file, or one of another plant.
+        DataError: a damaged file, one of another plant, or a figure of models of different seeds.
     """
     check_methods(settings.methods)
     if figure and find_spec("matplotlib") is None:
@@ -71,6 +72,8 @@ def run(
             "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
         )
     subject = open_subject(settings, screen, checkpoint, dataset, further)
+    if figure:
+        subject.check_one_training_seed()
     inputs = subject.inputs(remeasure=remeasure)
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
         result = record.result
@@ -132,8 +135,10 @@ def curves_for(
     return {
         "checkpoint": subject.path,
         "checkpoints": {name: path for name, path in paths.items() if path},
+        "training_seeds": subject.training_seeds(methods),
         "plant": settings.plant,
         "seed": settings.seed,
+        "loop_version": LOOP_VERSION,
         "acceptable_score": settings.protocol.acceptable_score,
         "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
         "horizon": list(range(settings.protocol.horizon + 1)),

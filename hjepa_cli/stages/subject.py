@@ -72,6 +72,25 @@ class Subject:
             shares.setdefault(holder.path, (holder, []))[1].append(name)
         return list(shares.values())
 
+    def training_seeds(self, methods: Iterable[str]) -> dict[str, int | None]:
+        """The seed that the model of each method was trained with, ``None`` if it does not say.
+
+        Methods without a model are left out.
+        """
+        holders = {name: self.of(name).model for name in methods if name not in TRUE_STATE}
+        return {name: model.metadata.get("seed") for name, model in holders.items() if model}
+
+    def check_one_training_seed(self) -> None:
+        """Raise DataError if the models of the settings' methods come from different seeds."""
+        seeds = self.training_seeds(self.measurable(self.settings.methods))
+        if len(set(seeds.values())) > 1:
+            of = ", ".join(f"{name}: {seed}" for name, seed in seeds.items())
+            raise DataError(
+                f"a figure of models that were trained with different seeds ({of}) compares "
+                "trainings, not methods",
+                hint="choose --methods of one seed; for several trainings, hjepa compare",
+            )
+
     @property
     def digest(self) -> Digest:
         """What curves must have been measured with to be this subject's."""
