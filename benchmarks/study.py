@@ -6,7 +6,8 @@
 A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and rows, each a name and
 the settings in which it differs from the preset and from what all rows have in ``common``. A row
 with ``strides`` trains these, one with ``flat`` also single levels of these depths on the same
-encoder, with the same actor. A row with a ``checkpoint`` only measures that one.
+encoder, with the same actor. A row whose ``encoder.method`` is a baseline on raw frames ends
+there. A row with a ``checkpoint`` only measures that one.
 
 Everything is kept below ``--out`` in directories named after what they depend on, so rows share
 what they can (one dataset, one encoder), an interrupted study goes on with the same command, and a
@@ -103,6 +104,8 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
     data, encoder = directory("collect"), directory("train-encoder")
     run("collect", "--out", data)
     trained = run("train-encoder", "--no-gate", "--dataset", data, "--out", encoder)
+    if changes.get("encoder", {}).get("method", "jepa") != "jepa":  # on raw frames, no levels
+        return {"health": trained["health"], "methods": evaluate(encoder, methods)}
 
     def levels(strides: list[int] | None, on: Path) -> Path:
         of = directory("train-hierarchy", strides)

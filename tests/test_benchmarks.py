@@ -140,6 +140,7 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
         {"name": "long", "encoder": {"steps": 7}},
         {"name": "other strides", "strides": [16, 4, 1]},
         {"name": "measured otherwise", "protocol": {"curve_devices": 8}, "flat": [2, 3]},
+        {"name": "raw frames", "encoder": {"method": "supervised"}},
         {"name": "fixed", "checkpoint": "desktop-h4m2l1", "protocol": {"plant_spread": 0.2}},
     ]
     for row in rows:
@@ -150,8 +151,9 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
 
     assert len(set(used("collect", "--out"))) == 1
     encoders, levels = used("train-encoder", "--out"), used("train-hierarchy", "--out")
+    raw = encoders.pop()
     assert encoders == [encoders[0], encoders[1], encoders[0], encoders[0]]
-    assert encoders[0] != encoders[1]
+    assert len({raw, *encoders}) == 3
     assert len(set(levels)) == 5 and levels[3] == levels[0]
     assert used("train-hierarchy", "--encoder") == [*encoders, levels[0], levels[0]]
     strides = [[word for word in words if word.startswith("--h=")] for words in ran]
@@ -159,9 +161,12 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
         *([], [], ["--h=16"], []),
         *(["--h=2"], ["--h=3"]),
     ]
-    assert used("eval", "--checkpoint") == [*levels, "desktop-h4m2l1"]
-    assert used("eval", "--methods") == [*["hjepa"] * 4, "ts-jepa-2", "ts-jepa-3", "hjepa"]
-    assert len(set(used("eval", "--out"))) == 7
+    assert used("eval", "--checkpoint") == [*levels, raw, "desktop-h4m2l1"]
+    assert used("eval", "--methods") == [
+        *(*["hjepa"] * 4, "ts-jepa-2", "ts-jepa-3"),
+        *("hjepa", "hjepa"),
+    ]
+    assert len(set(used("eval", "--out"))) == 8
     # What is only measured otherwise is not trained again: no stage sees the settings of another.
     configs = {words[0]: Path(words[words.index("--config") + 1]) for words in ran[-8:]}
     assert "curve_devices" not in configs["train-hierarchy"].read_text()
