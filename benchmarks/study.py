@@ -12,8 +12,9 @@ there. A row with a ``checkpoint`` only measures that one.
 Everything is kept below ``--out`` in directories named after what they depend on, so rows share
 what they can (one dataset, one encoder), an interrupted study goes on with the same command, and a
 study with more seeds or rows only adds to it. The table goes to the screen and to ``OUT/STUDY.md``,
-all numbers to ``OUT/STUDY.json``. With several seeds the intervals are Student's over seeds; with
-one, the bootstrap's over devices or rollouts, and they say nothing about another training.
+all numbers to ``OUT/STUDY.json``; a study whose rows are numbers of its ``axis`` is drawn in
+``OUT/STUDY.png`` too. With several seeds the intervals are Student's over seeds; with one, the
+bootstrap's over devices or rollouts, and they say nothing about another training.
 """
 
 import argparse
@@ -25,8 +26,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from hjepa_cli import figures
 from hjepa_cli.core.metrics import student_interval
 from hjepa_cli.stages.compare import differences
 
@@ -63,7 +68,7 @@ def main() -> None:
             print(f"{row['name']}, seed {seed}", file=sys.stderr, flush=True)
             result = measure(row, seed, row.get("methods", methods), arguments.out)
             measured.setdefault(row["name"], {})[seed] = result
-            write(measured, arguments.out / arguments.study)
+            write(measured, arguments.out / arguments.study, study.get("axis"))
     print((arguments.out / f"{arguments.study}.md").read_text())
 
 
@@ -142,8 +147,10 @@ def as_toml(sections: dict[str, dict[str, Any]]) -> str:
     )
 
 
-def write(measured: dict[str, dict[int, dict[str, Any]]], path: Path) -> None:
-    """``PATH.json`` with everything and ``PATH.md`` with the table."""
+def write(
+    measured: dict[str, dict[int, dict[str, Any]]], path: Path, axis: str | None = None
+) -> None:
+    """``PATH.json`` with everything, ``PATH.md`` with the table, ``PATH.png`` with an axis."""
     path.with_suffix(".json").write_text(json.dumps(measured, indent=1))
     windows = windows_of(measured)
     head = ["row", "method", "n", *(f"R² {name}" for name in PROBES), "actor NRMSE"]
@@ -179,6 +186,46 @@ def write(measured: dict[str, dict[int, dict[str, Any]]], path: Path) -> None:
             )
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     path.with_suffix(".md").write_text(f"{text}\n\n{compared(measured)}")
+    if axis is not None:
+        figures.save(size_figure(measured, axis), path.with_suffix(".png"))
+
+
+def size_figure(measured: dict[str, dict[int, dict[str, Any]]], axis: str) -> Figure:
+    """Probes and control error of the rows' first method against what the rows are named by."""
+    sizes = [int(name) for name in measured]
+
+    def line(axes: Axes, label: str, marker: str, values: list[list[float]]) -> None:
+        middle = [float(np.mean(of)) for of in values]
+        axes.plot(sizes, middle, marker=marker, markersize=3, label=label)
+        if min(map(len, values)) > 1:
+            ends = np.array([student_interval(np.array(of)) for of in values])
+            axes.fill_between(sizes, *ends.T, alpha=0.18, linewidth=0)
+
+    with matplotlib.rc_context(figures.RC):
+        figure = Figure(figsize=(2 * figures.WIDTH_IN, 2.5), layout="constrained")
+        probes, errors = figure.subplots(1, 2)
+        rows = [list(by_seed.values()) for by_seed in measured.values()]
+        for probe, marker in zip(PROBES, "o^sD", strict=True):
+            r2 = [[result["health"]["probe_r2"][probe] for result in row] for row in rows]
+            line(probes, probe, marker, r2)
+        entries = [[next(iter(result["methods"].values())) for result in row] for row in rows]
+        for window, marker in zip(windows_of(measured), "o^sD", strict=False):
+            line(
+                errors,
+                f"{window} steps after a packet",
+                marker,
+                [[entry["nmae_windows"][window] for entry in row] for row in entries],
+            )
+        probes.set_ylabel("Held-out R² of a linear probe")
+        errors.set_ylabel("NMAE of the force")
+        errors.set_ylim(bottom=0)
+        for axes in (probes, errors):
+            axes.set_xscale("log", base=2)
+            axes.set_xticks(sizes, labels=[str(size) for size in sizes])
+            axes.set_xlabel(axis)
+            axes.grid(visible=True)
+            axes.legend(frameon=False)
+        return figure
 
 
 def windows_of(measured: dict[str, dict[int, dict[str, Any]]]) -> list[str]:

@@ -92,7 +92,9 @@ def test_every_row_of_a_study_is_a_recipe_with_a_name_of_its_own(
     path: Path, tmp_path: Path
 ) -> None:
     study, as_toml = tomllib.loads(path.read_text()), load("study").as_toml
-    assert set(study) - {"common"} == {"methods", "row"} and set(study["methods"]) <= set(METHODS)
+    assert set(study) - {"common", "axis"} == {"methods", "row"} and set(study["methods"]) <= set(
+        METHODS
+    )
     rows = load("study").rows_of(study)
     names = [row["name"] for row in rows]
     assert len(set(names)) == len(names)
@@ -180,3 +182,30 @@ def test_intervals_of_a_study_are_students_over_seeds() -> None:
     assert over_seeds(values, 1) == f"175.0 ({low:.1f} – {high:.1f})"
     assert over_seeds([3.0], 2, [1.0, 4.0]) == "3.00 (1.00 – 4.00)"
     assert over_seeds([], 2) == "–"
+
+
+def test_a_study_of_sizes_is_drawn(tmp_path: Path) -> None:
+    study = load("study")
+    windows = {"1-20": 0.006, "81-100": 0.003}
+
+    def result(r2: float) -> dict[str, object]:
+        entry = {
+            "nmae_windows": windows,
+            "nmae_windows_ci95": {window: [0.0, 1.0] for window in windows},
+            "tolerance_gap_steps": 180.0,
+            "tolerance_gap_ci95": [170.0, 190.0],
+        }
+        health = {"probe_r2": dict.fromkeys(study.PROBES, r2), "actor_nrmse": 0.06}
+        return {"health": health, "methods": {"hjepa": entry}}
+
+    measured = {"64": {0: result(0.97)}, "256": {0: result(0.99)}}
+    study.write(measured, tmp_path / "embedding", "Values of an embedding")
+    assert (tmp_path / "embedding.png").stat().st_size > 10_000
+    probes, errors = study.size_figure(measured, "Values of an embedding").axes
+    assert [line.get_label() for line in probes.lines] == list(study.PROBES)
+    assert all(list(line.get_xdata()) == [64, 256] for line in probes.lines + errors.lines)
+    assert list(probes.lines[0].get_ydata()) == [0.97, 0.99]
+    assert probes.get_xlabel() == "Values of an embedding"
+    assert not probes.collections  # one seed has no interval over trainings
+    twice = {size: {0: of[0], 1: of[0]} for size, of in measured.items()}
+    assert len(study.size_figure(twice, "n").axes[0].collections) == len(study.PROBES)
