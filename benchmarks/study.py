@@ -112,19 +112,19 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
     if changes.get("encoder", {}).get("method", "jepa") != "jepa":  # on raw frames, no levels
         return {"health": trained["health"], "methods": evaluate(encoder, methods)}
 
-    def levels(strides: list[int] | None, on: Path) -> Path:
+    def levels(strides: list[int] | None, on: Path) -> tuple[Path, dict[str, Any]]:
         of = directory("train-hierarchy", strides)
         given = zip("hml", strides or (), strict=False)
         words = [f"--{name}={value}" for name, value in given]
-        run("train-hierarchy", *words, "--dataset", data, "--encoder", on, "--out", of)
-        return of
+        health = run("train-hierarchy", *words, "--dataset", data, "--encoder", on, "--out", of)
+        return of, health["health"]
 
     strides = row.get("strides")
-    hierarchy = levels(strides, encoder)
+    hierarchy, health = levels(strides, encoder)
     measured = evaluate(hierarchy, methods, strides)
     for depth in row.get("flat", ()):
-        measured |= evaluate(levels([depth], hierarchy), [f"ts-jepa-{depth}"], strides)
-    return {"health": trained["health"], "methods": measured}
+        measured |= evaluate(levels([depth], hierarchy)[0], [f"ts-jepa-{depth}"], strides)
+    return {"health": health, "methods": measured}  # of the actor that drives, not of a probe
 
 
 def hjepa(*words: object) -> dict[str, Any]:
