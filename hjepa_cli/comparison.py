@@ -63,7 +63,7 @@ def _error_panels(figure: SubFigure, entries: Entries, step_ms: float) -> None:
     at_once.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     at_once.yaxis.set_minor_formatter(NullFormatter())
     at_once.set_ylabel("NMAE of the force")
-    later.set_xlabel("Time since the only packet (ms)")
+    later.set_xlabel("Time since the packet (ms)")
     later.set_title("(a) control error")
 
 
