@@ -202,8 +202,9 @@ def size_figure(measured: dict[str, dict[int, dict[str, Any]]], axis: str) -> Fi
             axes.fill_between(sizes, *ends.T, alpha=0.18, linewidth=0)
 
     with matplotlib.rc_context(figures.RC):
-        figure = Figure(figsize=(2 * figures.WIDTH_IN, 2.5), layout="constrained")
-        probes, errors = figure.subplots(1, 2)
+        figure = Figure(figsize=(2 * figures.WIDTH_IN, 2.8), layout="constrained")
+        left, right = figure.subfigures(1, 2)
+        probes, errors = left.subplots(), right.subplots()
         rows = [list(by_seed.values()) for by_seed in measured.values()]
         for probe, marker in zip(PROBES, "o^sD", strict=True):
             r2 = [[result["health"]["probe_r2"][probe] for result in row] for row in rows]
@@ -224,7 +225,8 @@ def size_figure(measured: dict[str, dict[int, dict[str, Any]]], axis: str) -> Fi
             axes.set_xticks(sizes, labels=[str(size) for size in sizes])
             axes.set_xlabel(axis)
             axes.grid(visible=True)
-            axes.legend(frameon=False)
+        for side in (left, right):
+            side.legend(loc="outside lower center", ncols=2, frameon=False)
         return figure
 
 

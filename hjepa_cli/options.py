@@ -484,6 +484,19 @@ EvaluationPaths = Annotated[
         autocompletion=completion.runs,
     ),
 ]
+ComparedMethods = Annotated[
+    str | None,
+    _plain(
+        LOOP,
+        "--methods",
+        "Only these, separated by commas: the first against the others. Without it: all found.",
+        metavar="A,B,C",
+    ),
+]
+ComparisonDirectory = Annotated[
+    Path | None,
+    _plain(FILES, "--figures", "Draw the paper's Fig. 3 into this directory.", metavar="DIR"),
+]
 ReportOut = Annotated[
     Path,
     typer.Option(

@@ -226,8 +226,8 @@ def report(
 
 def compare(
     runs: options.EvaluationPaths = None,
-    methods: options.Methods = None,
-    figures: options.FigureDirectory = None,
+    methods: options.ComparedMethods = None,
+    figures: options.ComparisonDirectory = None,
     format: options.FigureFormats = "pdf",
     as_json: options.Json = False,
     quiet: options.Quiet = False,

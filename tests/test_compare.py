@@ -40,7 +40,7 @@ def evaluated(training, methods=("hjepa", "ts-jepa-4", "oracle"), name=None, **c
         "acceptable_lq_ratio": 0.8,
         "horizon": list(range(101)),
         "training_seeds": {name: training for name in methods if name != "oracle"},
-        "methods": {name: entry(name, training) for name in methods},
+        "methods": {name: entry(name, training or 0) for name in methods},
     }
     directory = Path("runs/eval") / (name or f"seed-{training}")
     with Run.create("eval", directory, settings) as record:
@@ -68,7 +68,7 @@ def test_means_and_intervals_are_over_trainings(shell):
         assert np.array(found["nmae_ci95"]) == pytest.approx(middle[:, None] + [[-half, half]])
         assert found["n_trainings"] == 3
     oracle = document["methods"]["oracle"]  # one measurement, found three times
-    assert oracle["n_trainings"] == 1
+    assert oracle["n_trainings"] == 0
     assert oracle["tolerance_gap_ci95"] == ZOO["oracle"]["tolerance_gap_ci95"]
 
 
@@ -110,7 +110,7 @@ def test_the_figure_has_every_method_and_its_band(shell):
 @pytest.mark.parametrize(
     ("changes", "fragments"),
     [
-        ({"plant": "gym"}, ("plant is desktop", "gym in runs/eval/seed-1")),
+        ({"plant": "gym"}, ("plant is 'desktop'", "'gym' in runs/eval/seed-1")),
         ({"loop_version": 1}, ("loop_version is 2", "1 in")),
         ({"protocol": {"steps": 250}}, ("protocol.steps is 1000", "250 in")),
         ({"horizon": [0, 1]}, ("horizon",)),
@@ -156,7 +156,7 @@ def test_every_method_needs_the_same_trainings(shell):
 
 def test_one_training_is_no_comparison(shell):
     evaluated(3, ("oracle",))
-    assert_one_line_error(shell("compare"), 66, "needs two of them", "seed 0")
+    assert_one_line_error(shell("compare"), 66, "needs two of them", "no model")
 
 
 def test_nothing_to_compare(shell):
@@ -172,4 +172,78 @@ def test_a_run_of_an_older_version_says_how_to_measure_it_again(shell):
     (old / "result.json").write_text(json.dumps(document))
     outcome = shell("compare")
     assert_one_line_error(outcome, 65, "older version")
-    assert "hjepa eval --config runs/eval/seed-1/config.toml" in outcome.err
+    assert "hjepa eval --config runs/eval/seed-1/config.toml --out" in outcome.err
+
+
+def test_the_order_is_that_of_the_methods_not_of_files(shell):
+    for seed in range(2):
+        evaluated(seed, ("oracle", "ts-jepa-4", "hjepa"))
+    found = list(shell("compare", "--json").document["methods"])
+    assert found == ["hjepa", "ts-jepa-4", "oracle"]
+
+
+def test_methods_without_a_model_are_no_trainings(shell):
+    for seed in range(2):
+        evaluated(seed, ("hjepa",))
+    evaluated(None, ("oracle",), "oracle", seed=7)
+    document = shell("compare", "--json").document
+    assert document["training_seeds"] == [0, 1]
+    assert document["methods"]["oracle"]["n_trainings"] == 0
+    assert document["methods"]["hjepa"]["n_trainings"] == 2
+    assert_one_line_error(shell("compare", "--methods", "hjepa,optimal"), 66, "optimal was not")
+
+
+def test_methods_choose_what_a_mixed_run_is_taken_for(shell):
+    evaluated(0)
+    evaluated(1, training_seeds={"hjepa": 1, "ts-jepa-4": 0})
+    assert_one_line_error(shell("compare"), 65, "different seeds")
+    assert shell("compare", "--methods", "hjepa,oracle").code == 0
+
+
+def test_bounds_have_no_ratio_and_intervals_stay_in_range(shell):
+    for seed, gap in enumerate((2.0, 320.0)):
+        path = evaluated(seed) / "result.json"
+        document = json.loads(path.read_text())
+        document["methods"]["hjepa"] |= {
+            "tolerance_gap_steps": gap,
+            "tolerance_gap_censored": seed == 1,
+        }
+        path.write_text(json.dumps(document))
+    document = shell("compare", "--json").document
+    low, high = document["methods"]["hjepa"]["tolerance_gap_ci95"]
+    assert low == 0 < 161 < high
+    assert document["methods"]["hjepa"]["tolerance_gap_censored"]
+    assert document["differences"][0]["tolerance_gap_ratio"] is None
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [
+        ("training_seeds", [1], "with which seeds"),
+        ("training_seeds", {"hjepa": True, "ts-jepa-4": True}, "does not say with which seed"),
+        ("methods", [], "no methods"),
+        ("methods", {"hjepa": None}, "method 'hjepa'"),
+        ("horizon", [0], "over the horizon"),
+    ],
+)
+def test_damaged_results_are_named(shell, key, value, reason):
+    evaluated(0)
+    path = evaluated(1) / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    assert_one_line_error(shell("compare"), 65, "runs/eval/seed-1", reason)
+
+
+def test_rollouts_of_one_training_are_the_same(shell):
+    settings = load_settings().as_dict()
+    for seed in range(2):
+        evaluated(seed)
+    first = json.loads(Path("runs/eval/seed-1/result.json").read_text())
+    inputs = {"dataset": {"path": "data", "sha256": "f" * 64}}
+    with Run.create("eval", Path("runs/eval/other"), settings, inputs) as record:
+        record.finish(first)
+    assert_one_line_error(shell("compare"), 65, "dataset is")
+    settings["collect"]["clean_steps"] = 130
+    with Run.create("eval", Path("runs/eval/seed-2"), settings) as record:
+        record.finish(first | {"training_seeds": {"hjepa": 2, "ts-jepa-4": 2}})
+    runs = [f"runs/eval/seed-{seed}" for seed in (0, 2)]
+    assert_one_line_error(shell("compare", *runs), 65, "collect.clean_steps is 120")

@@ -15,33 +15,50 @@ from typing import Any
 
 import numpy as np
 
-from hjepa_cli.checks import TRUE_STATE, check_methods
+from hjepa_cli.checks import METHODS, TRUE_STATE, check_methods
 from hjepa_cli.core.metrics import student_interval
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.screen import Screen, span
-from hjepa_cli.stages.report import FIGURE_FORMATS, found_runs, stage_of
-from hjepa_cli.storage import runs
+from hjepa_cli.stages.report import (
+    FIGURE_FORMATS,
+    NO_RESULT,
+    SMOKE,
+    found_runs,
+    inputs_of,
+    stage_of,
+)
+from hjepa_cli.storage import curves, runs
 from hjepa_cli.storage.curves import Entry
 
-AVERAGED = {  # of an entry of ``eval --json``, and where the interval of it goes
-    "nmae": "nmae_ci95",
-    "nmae_every_step": "nmae_every_step_ci95",
-    "score": "score_ci95",
-    "tolerance_gap_steps": "tolerance_gap_ci95",
-    "tolerance_p": "tolerance_p_ci95",
+AVERAGED = {  # of an entry of ``eval --json``, where the interval of it goes, and its range
+    "nmae": ("nmae_ci95", (0.0, None)),
+    "nmae_every_step": ("nmae_every_step_ci95", (0.0, None)),
+    "score": ("score_ci95", (0.0, None)),
+    "tolerance_gap_steps": ("tolerance_gap_ci95", (0.0, None)),
+    "tolerance_p": ("tolerance_p_ci95", (0.0, 1.0)),
 }
 ALIKE = ("plant", "loop_version", "horizon", "acceptable_score", "acceptable_lq_ratio")
+
+ByMethod = dict[str, dict[int, Entry]]
+"""Entries by method and seed: of the training, or without one of the evaluation."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """A finished run of ``eval`` whose models come from one training seed."""
+    """A finished run of ``eval`` whose models, if it has any, come from one training seed."""
 
     directory: Path
     result: Mapping[str, Any]
     config: Mapping[str, Any]
-    training_seed: int
+    dataset: str | None
+    training_seed: int | None
+
+    def seed_of(self, method: str) -> int:
+        """The training's, or of a method without a model the evaluation's."""
+        if method in TRUE_STATE or self.training_seed is None:
+            return int(self.result["seed"])
+        return self.training_seed
 
 
 def run(
@@ -64,7 +81,8 @@ def run(
     Raises:
         UsageError: no such method.
         MissingInputError: no runs, fewer than two trainings, or a method that a training lacks.
-        DataError: runs of different plants, protocols or versions, or two models of one seed.
+        DataError: runs of different plants, protocols or versions, two models of one seed, or a
+            result that no ``eval`` wrote.
     """
     if methods is not None:
         check_methods(tuple(methods))
@@ -72,17 +90,21 @@ def run(
         raise MissingInputError(
             "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
         )
-    found = [opened(path) for path in evaluations(paths)]
+    found = [opened(directory, methods) for directory in evaluations(paths)]
+    if any(one.config["preset"] == SMOKE for one in found):
+        screen.say(NO_RESULT)
     check_alike(found)
-    by_method = collected(found, methods)
-    seeds = sorted({one.training_seed for one in found})
+    by_method, seeds = collected(found, methods)
     first = found[0].result
     document = {
         "plant": first["plant"],
         "training_seeds": seeds,
         "acceptable_score": first["acceptable_score"],
         "horizon": first["horizon"],
-        "methods": {name: averaged(list(of.values())) for name, of in by_method.items()},
+        "methods": {
+            name: averaged(list(of.values())) | {"n_trainings": count(name, of)}
+            for name, of in by_method.items()
+        },
         "differences": differences(by_method),
         "runs": [one.directory for one in found],
     }
@@ -102,33 +124,87 @@ def evaluations(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def opened(directory: Path) -> Evaluation:
-    """One run. Raises DataError where its models come from several trainings, or it is too old."""
+def opened(directory: Path, methods: Sequence[str] | None) -> Evaluation:
+    """One run, reduced to ``methods``.
+
+    Raises:
+        DataError: no result of ``eval``, an older one, or models of several trainings.
+    """
     result, config = runs.read_result(directory), runs.read_config(directory)
-    again = f"hjepa eval --config {shlex.quote(str(directory / runs.CONFIG))}"
-    if "training_seeds" not in result:
+    environment = runs.read_environment(directory)
+    if reason := flaw(result, config):
+        again = ["hjepa", "eval", "--config", str(directory / runs.CONFIG)]
+        again += [*inputs_of(environment), "--out", f"{directory}-again", "--remeasure"]
         raise DataError(
-            f"{directory} does not say with which seeds its models were trained: an older version "
-            "measured it",
-            hint=again,
+            f"{directory / runs.RESULT}: {reason}",
+            hint=f"leave it out, or in its place: {shlex.join(again)}",
         )
-    trained = set(result["training_seeds"].values())
-    if None in trained:
+    entries = {
+        name: entry
+        for name, entry in result["methods"].items()
+        if methods is None or name in methods
+    }
+    dataset = environment["inputs"].get("dataset")
+    return Evaluation(
+        directory,
+        result | {"methods": entries},
+        config | {"preset": environment["preset"]},
+        dataset["sha256"] if isinstance(dataset, dict) else None,
+        training_seed(directory, result["training_seeds"], entries),
+    )
+
+
+def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
+    """Why a run cannot be compared with others, if anything is wrong with it."""
+    for key in (*ALIKE, "seed"):
+        if key not in result:
+            return f"'{key}' is missing"
+    for section in ("protocol", "conditions", "collect"):
+        if not isinstance(config.get(section), dict):
+            return f"its settings have no [{section}]"
+    if not isinstance(result.get("training_seeds"), dict):
+        return "it does not say with which seeds its models were trained (an older version?)"
+    if not isinstance(result.get("methods"), dict):
+        return "no methods"
+    steps = len(result["horizon"]) if isinstance(result["horizon"], list) else 0
+    for name, entry in result["methods"].items():
+        if reason := curves.flaw(entry):
+            return f"method '{name}': {reason}"
+        if "nmae_every_step" not in entry:
+            return f"method '{name}': no 'nmae_every_step' (an older version?)"
+        if not steps == len(entry["nmae"]) == len(entry["nmae_ci95"]):
+            return f"method '{name}': 'nmae' is not over the horizon"
+    return None
+
+
+def training_seed(
+    directory: Path, seeds: Mapping[str, Any], entries: Mapping[str, Entry]
+) -> int | None:
+    """The one seed that the models of ``entries`` were trained with; None if they need no model.
+
+    Raises:
+        DataError: it is not known, or there are several.
+    """
+    of = {name: seeds.get(name) for name in entries if name not in TRUE_STATE}
+    for name, seed in of.items():
+        if type(seed) is not int:
+            raise DataError(
+                f"the model of {name} in {directory} does not say with which seed it was trained",
+                hint="leave the run or the method (--methods) out, or train the model again",
+            )
+    if len(set(of.values())) > 1:
+        named = ", ".join(f"{name}: {seed}" for name, seed in of.items())
         raise DataError(
-            f"a model of {directory} does not say with which seed it was trained", hint=again
+            f"the models of {directory} were trained with different seeds ({named})",
+            hint="choose --methods of one seed, or hjepa eval --checkpoint PATH --methods … for "
+            "the models of each",
         )
-    if len(trained) > 1:
-        of = ", ".join(f"{name}: {seed}" for name, seed in result["training_seeds"].items())
-        raise DataError(
-            f"the models of {directory} were trained with different seeds ({of})",
-            hint="hjepa eval --checkpoint PATH --methods …, for the models of one seed each",
-        )
-    return Evaluation(directory, result, config, trained.pop() if trained else result["seed"])
+    return next(iter(of.values()), None)
 
 
 def check_alike(found: Sequence[Evaluation]) -> None:
     """Refuse what is not measured alike. Raises DataError naming the difference."""
-    first, of_seed = found[0], dict[int, Evaluation]()
+    first, of_training = found[0], dict[int | None, Evaluation]()
     for other in found:
         named = [(first, key, first.result[key], other.result[key]) for key in ALIKE]
         for section in ("protocol", "conditions"):
@@ -137,93 +213,119 @@ def check_alike(found: Sequence[Evaluation]) -> None:
                 (first, f"{section}.{key}", ours.get(key), theirs.get(key))
                 for key in dict.fromkeys((*ours, *theirs))
             ]
-        # Seeds of the evaluation may differ from training to training, not within one.
-        peer = of_seed.setdefault(other.training_seed, other)
-        named.append((peer, "seed", peer.result["seed"], other.result["seed"]))
+        named += [
+            (first, f"collect.{key}", first.config["collect"].get(key), value)
+            for key, value in other.config["collect"].items()
+            if key in curves.CLEAN
+        ]
+        # Draws may differ from training to training; within one they are what methods share.
+        if other.training_seed is not None:
+            peer = of_training.setdefault(other.training_seed, other)
+            named.append((peer, "seed", peer.result["seed"], other.result["seed"]))
+            named.append((peer, "dataset", peer.dataset, other.dataset))
         for one, key, ours, theirs in named:
             if ours != theirs:
                 raise DataError(
-                    f"{key} is {ours} in {one.directory}, {theirs} in {other.directory}: not to "
-                    "be compared",
+                    f"{key} is {ours!r} in {one.directory}, {theirs!r} in {other.directory}: not "
+                    "to be compared",
                     hint="name runs that were measured alike, or measure one again",
                 )
 
 
 def collected(
     found: Sequence[Evaluation], methods: Sequence[str] | None
-) -> dict[str, dict[int, Entry]]:
-    """Entries by method and training seed, the same seeds for all.
+) -> tuple[ByMethod, list[int]]:
+    """Entries by method and seed, and the training seeds, the same for all trained methods.
 
     Raises:
         MissingInputError: fewer than two trainings, or not the same ones for every method.
         DataError: two models of one method and one seed.
     """
-    by_method: dict[str, dict[int, Entry]] = {name: {} for name in methods or ()}
+    by_method: ByMethod = {}
     sources: dict[tuple[str, int], Path] = {}
     for one in found:
         for name, entry in one.result["methods"].items():
-            if methods is not None and name not in methods:
-                continue
-            known = by_method.setdefault(name, {})
-            if known.setdefault(one.training_seed, entry) != entry:
+            seed = one.seed_of(name)
+            source = sources.setdefault((name, seed), one.directory)
+            known = by_method.setdefault(name, {}).setdefault(seed, entry)
+            # Measured again elsewhere, what needs no model may differ in the last digits.
+            if name not in TRUE_STATE and known != entry:
                 raise DataError(
-                    f"two measurements of {name} with training seed {one.training_seed}: "
-                    f"{sources[name, one.training_seed]} and {one.directory}",
+                    f"two measurements of {name} with training seed {seed}: {source} and "
+                    f"{one.directory}",
                     hint="hjepa compare RUN…, with the runs that belong together",
                 )
-            sources.setdefault((name, one.training_seed), one.directory)
-    seeds = sorted({one.training_seed for one in found})
+    seeds = sorted({one.training_seed for one in found if one.training_seed is not None})
     if len(seeds) < 2:
+        of = f"these are all of seed {seeds[0]}" if seeds else "these have no model at all"
         raise MissingInputError(
-            f"a comparison over trainings needs two of them; these are all of seed {seeds[0]}",
+            f"a comparison over trainings needs two of them; {of}",
             hint="train and evaluate with another --seed, or hjepa report",
         )
-    for name, known in by_method.items():
-        if missing := [seed for seed in seeds if seed not in known]:
+    order = methods or [name for name in METHODS if name in by_method]
+    for name in order:
+        known_seeds = by_method.get(name, {})
+        missing = [seed for seed in seeds if seed not in known_seeds]
+        if name in TRUE_STATE and not known_seeds:
+            raise MissingInputError(f"{name} was not measured", hint=f"hjepa eval --methods {name}")
+        if name not in TRUE_STATE and missing:
             raise MissingInputError(
                 f"{name} was not measured with training seed {', '.join(map(str, missing))}",
                 hint=f"hjepa eval --methods {name} with a model of that seed, or leave it out: "
                 "--methods",
             )
-    return {name: dict(sorted(known.items())) for name, known in by_method.items()}
+    return {name: dict(sorted(by_method[name].items())) for name in order}, seeds
+
+
+def count(method: str, of: Mapping[int, Entry]) -> int:
+    """How many trainings a mean is over: none for methods without a model."""
+    return 0 if method in TRUE_STATE else len(of)
 
 
 def averaged(entries: Sequence[Entry]) -> Entry:
     """The entry of a method over its trainings: means, and Student's intervals over trainings.
 
-    What needs no training and was measured on the same draws every time is one measurement; it
-    keeps its own interval, over devices or rollouts.
+    Of a single entry (what needs no training, measured on the same draws every time) the interval
+    stays its own, over devices or rollouts.
     """
-    if all(entry == entries[0] for entry in entries):
-        return entries[0] | {"n_trainings": 1}
-    mean: Entry = {
-        "bits_per_transmission": entries[0]["bits_per_transmission"],
-        "n_trainings": len(entries),
-    }
-    for key, interval in AVERAGED.items():
+    keys = ("bits_per_transmission", "tolerance_gap_censored", "tolerance_p_censored")
+    if len(entries) == 1:
+        kept = [*keys, "nmae_windows", "nmae_windows_ci95", "gap_curve", "delivery_curve"]
+        kept += [*AVERAGED, *(interval for interval, _ in AVERAGED.values())]
+        return {key: entries[0][key] for key in kept}
+    mean: Entry = {}
+    for key in keys:
         values = [entry[key] for entry in entries]
-        mean[key], mean[interval] = over_trainings(values)
-    windows = entries[0]["nmae_windows"]
+        mean[key] = max(values) if all(value is not None for value in values) else None
+    for key, (interval, ends) in AVERAGED.items():
+        mean[key], mean[interval] = over_trainings([entry[key] for entry in entries], ends)
     mean["nmae_windows"], mean["nmae_windows_ci95"] = {}, {}
-    for window in windows:
+    for window in entries[0]["nmae_windows"]:
         values = [entry["nmae_windows"][window] for entry in entries]
-        mean["nmae_windows"][window], mean["nmae_windows_ci95"][window] = over_trainings(values)
-    for kind in ("gap", "p"):
-        mean[f"tolerance_{kind}_censored"] = any(e[f"tolerance_{kind}_censored"] for e in entries)
-    for curve, key in (("gap_curve", "d"), ("delivery_curve", "p")):
+        mean["nmae_windows"][window], mean["nmae_windows_ci95"][window] = over_trainings(
+            values, (0.0, None)
+        )
+    for curve, where in (("gap_curve", "d"), ("delivery_curve", "p")):
         mean[curve] = []
         for points in zip(*(entry[curve] for entry in entries), strict=True):
-            score, ci95 = over_trainings([point["score"] for point in points])
-            mean[curve].append({key: points[0][key], "score": score, "ci95": ci95})
+            score, ci95 = over_trainings([point["score"] for point in points], (0.0, None))
+            mean[curve].append({where: points[0][where], "score": score, "ci95": ci95})
     return mean
 
 
-def over_trainings(values: Sequence[Any]) -> tuple[Any, Any]:
-    """Mean and 95 % interval of numbers, or of equally long lists of numbers; None stays None."""
+def over_trainings(
+    values: Sequence[Any], ends: tuple[float | None, float | None] = (None, None)
+) -> tuple[Any, Any]:
+    """Mean and 95 % interval of numbers, or of equally long lists of numbers; None stays None.
+
+    The interval is cut where the values' range ``ends``.
+    """
     if any(value is None for value in values):
         return None, None
     array = np.array(values, float)
-    return array.mean(axis=0).tolist(), student_interval(array).T.tolist()
+    low, high = (-np.inf if ends[0] is None else ends[0]), (np.inf if ends[1] is None else ends[1])
+    interval = np.clip(student_interval(array), low, high)
+    return array.mean(axis=0).tolist(), interval.T.tolist()
 
 
 def differences(by_method: Mapping[str, Mapping[int, Entry]]) -> list[dict[str, Any]]:
@@ -232,12 +334,12 @@ def differences(by_method: Mapping[str, Mapping[int, Entry]]) -> list[dict[str, 
     Returns:
         Per other method: ``nmae_windows`` and ``nmae_every_step``, first minus other, and
         ``tolerance_gap_ratio``, first ÷ other; each with ``mean`` and ``ci95`` (of the ratio the
-        geometric mean, its interval taken on the logarithm).
+        geometric mean, its interval taken on the logarithm; ``None`` where a gap is a bound only).
     """
     first, *others = by_method
-    found = []
+    found: list[dict[str, Any]] = []
     for other in others:
-        if other in TRUE_STATE:
+        if other in TRUE_STATE or first in TRUE_STATE:
             continue
         pairs = [(by_method[first][s], by_method[other][s]) for s in by_method[first]]
         windows = {
@@ -248,8 +350,9 @@ def differences(by_method: Mapping[str, Mapping[int, Entry]]) -> list[dict[str, 
         }
         every = _described([a["nmae_every_step"] - b["nmae_every_step"] for a, b in pairs])
         gaps = [(a["tolerance_gap_steps"], b["tolerance_gap_steps"]) for a, b in pairs]
+        censored = any(entry["tolerance_gap_censored"] for pair in pairs for entry in pair)
         ratio = None
-        if all(a and b for a, b in gaps):
+        if all(a and b for a, b in gaps) and not censored:
             logarithm = _described([math.log(a / b) for a, b in gaps])
             ratio = {
                 "mean": math.exp(logarithm["mean"]),
@@ -279,7 +382,7 @@ def show(document: Mapping[str, Any], screen: Screen) -> None:
     seeds = ", ".join(map(str, document["training_seeds"]))
     screen.table(
         f"{document['plant']}, training seeds {seeds}: mean (95 % CI over trainings; of methods "
-        f"without training over devices or rollouts), tolerances at score "
+        f"without a model over draws), tolerances at score "
         f"{document['acceptable_score']:g}",
         ["method", *(f"NMAE {w}" for w in windows), "every packet", "gap D* [steps]", "p*"],
         [

@@ -71,7 +71,7 @@ def run(
         raise MissingInputError(
             "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
         )
-    subject = open_subject(settings, screen, checkpoint, dataset, further)
+    subject = open_subject(settings, screen, checkpoint, dataset, further, one_seed=figure)
     if figure:
         subject.check_one_training_seed()
     inputs = subject.inputs(remeasure=remeasure)

@@ -88,7 +88,7 @@ class Subject:
             raise DataError(
                 f"a figure of models that were trained with different seeds ({of}) compares "
                 "trainings, not methods",
-                hint="choose --methods of one seed; for several trainings, hjepa compare",
+                hint="give models of one seed; for several trainings, hjepa compare",
             )
 
     @property
@@ -136,6 +136,8 @@ def open_subject(
     checkpoint: str | None,
     dataset: Path | None,
     further: Sequence[Path] | None = None,
+    *,
+    one_seed: bool = False,
 ) -> Subject:
     """Load what is to be evaluated, and say which models they are where the user did not.
 
@@ -145,6 +147,7 @@ def open_subject(
         checkpoint: zoo name, run directory or file of the first model.
         dataset: whose clean rollouts to use.
         further: models of the other methods; ``None`` looks for them.
+        one_seed: look for those only that were trained with the first model's seed.
 
     Raises:
         MissingInputError, DataError: no such file, damaged, or of another plant.
@@ -161,7 +164,8 @@ def open_subject(
     held = (*(model.methods if model else ()), *TRUE_STATE)
     lacking = [name for name in settings.methods if name not in held]
     if further is None:
-        further = _find(lacking, settings, screen) if lacking else []
+        seed = model.metadata.get("seed") if one_seed and model else None
+        further = _find(lacking, settings, screen, seed) if lacking else []
     others = tuple(
         Subject(settings, Model.load(other, settings.device), other, data) for other in further
     )
@@ -212,13 +216,18 @@ def _default_model(settings: Settings, screen: Screen) -> Path | None:
     return None
 
 
-def _find(methods: Sequence[str], settings: Settings, screen: Screen) -> list[Path]:
-    """A model for each method that has one: of the newest run, else of the zoo."""
+def _find(
+    methods: Sequence[str], settings: Settings, screen: Screen, seed: int | None
+) -> list[Path]:
+    """A model for each method that has one: of the newest run, else of the zoo.
+
+    With a ``seed`` only models that were trained with it.
+    """
     missing, found = list(methods), []
     for path in _candidates():
         if not missing:
             break
-        held = _held(path, settings.plant)
+        held = _held(path, settings.plant, seed)
         if taken := [name for name in missing if name in held]:
             found.append(path)
             screen.say(f"{', '.join(taken)}: model {path}")
@@ -234,10 +243,13 @@ def _candidates() -> Iterator[Path]:
     yield from map(zoo.resolve_model, zoo.list_models())
 
 
-def _held(path: Path, plant_name: str) -> tuple[str, ...]:
-    """The methods that a checkpoint offers to a plant; none if it is damaged or of another one."""
+def _held(path: Path, plant_name: str, seed: int | None) -> tuple[str, ...]:
+    """The methods that a checkpoint offers to a plant.
+
+    None if it is damaged, of another plant, or not trained with the ``seed`` that is asked for.
+    """
     with contextlib.suppress(HjepaError, KeyError, TypeError):
         metadata = load_checkpoint(path).metadata
-        if metadata["plant"] == plant_name:
+        if metadata["plant"] == plant_name and seed in (None, metadata.get("seed")):
             return offered(metadata["architecture"], len(plant(plant_name).state_names))
     return ()

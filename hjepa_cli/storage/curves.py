@@ -28,7 +28,7 @@ Check = Callable[[Any], bool]
 NOMINAL = {"light": 1.0, "camera_noise": 0.0, "pole_length": 1.0}
 
 LARGEST = 1e12  # beyond anything that is measured; keeps arithmetic in range
-_CLEAN = (
+CLEAN = (  # settings of ``collect`` that clean rollouts depend on
     "clean_trajectories",
     "clean_steps",
     "x_m",
@@ -74,7 +74,7 @@ class Digest:
         source = values if dataset is None else dataset
         try:
             collected = source["collect"]
-            clean = [source["seed"], *(collected[key] for key in _CLEAN)]
+            clean = [source["seed"], *(collected[key] for key in CLEAN)]
             clean += collected.get("start", [])
         except (LookupError, TypeError, AttributeError):
             raise DataError(
@@ -113,7 +113,7 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
     if document.get("digest") != dataclasses.asdict(digest):
         return {}
     for name, entry in document["methods"].items():
-        if reason := _flaw(entry):
+        if reason := flaw(entry):
             raise _damaged(path, f"method '{name}': {reason}")
     return dict(document["methods"])
 
@@ -178,7 +178,7 @@ def _newest_first(*stages: Path) -> list[Path]:
     )
 
 
-def _flaw(entry: object) -> str | None:
+def flaw(entry: object) -> str | None:
     """What keeps an entry from being used, if anything."""
     if not isinstance(entry, dict):
         return "not an object"
