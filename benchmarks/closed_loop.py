@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.checks import ANCHORS, TRUE_STATE
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.model import Model, build_modules
 from hjepa_cli.core.plant import CartPoles, plant
@@ -57,7 +57,7 @@ def pieces(model: Model, devices: int) -> None:
     macs = multiply_accumulates(lambda: model.encode(frames[:1]))
     print(f"encoder   {macs / 1e6:12.1f} million MACs per embedding")
     z = torch.randn(devices, model.architecture["embedding"], device=model.device)
-    for name in (method for method in model.methods if method not in ("hold", "zero")):
+    for name in (name for name in model.methods if name not in ("hold", "zero", *ANCHORS)):
         planner = model.planner(name)
         with torch.inference_mode():
             took_ms = 1e3 * seconds(lambda planner=planner: planner.plan(z))
@@ -78,7 +78,8 @@ def loops(model: Model, settings: Settings, devices: int, steps: int) -> None:
     print(
         f"real-time factor of {devices} devices together, {steps} steps of {kind.step_s * 1e3:g} ms"
     )
-    for name in (*model.methods, *(method for method in TRUE_STATE if method != "optimal")):
+    trained = (name for name in model.methods if name not in ANCHORS)
+    for name in (*trained, *(name for name in TRUE_STATE if name != "optimal")):
         factors = []
         for gap in (1.0, 20.0, 80.0):
             started = time.perf_counter()

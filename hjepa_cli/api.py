@@ -122,7 +122,7 @@ def drive(
     if delivery is not None:
         schedule = delivery_schedule(delivery, draws.delivery)
     else:
-        schedule = gap_schedule(gap_steps or 1, draws.steps, devices)
+        schedule = gap_schedule(1 if gap_steps is None else gap_steps, draws.steps, devices)
     how = build_method(method, chosen, model)
     states: list[Floats] = []
     forces: list[Floats] = []
@@ -137,6 +137,7 @@ def drive(
         (schedule if how.uses_link else np.ones_like(schedule))[None],
         how.controller(devices),
         how.sensor,
+        delay_steps=how.delay_steps,
         watch=watch,
     )
     return {

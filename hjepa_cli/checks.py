@@ -51,6 +51,8 @@ LATE = "+"  # between a method and the steps that its packets are late
 # Those whose packets need no link, or that send none.
 LINKLESS = ("optimal", "local")
 
+ANY_DEPTH = re.compile(r"ts-jepa-[1-9]\d{0,4}")  # of a level that somebody trains
+
 # Those fitted in closed form to embeddings, where they are measured.
 ANCHORS = ("linear", "state-kf", "state-48", "local")
 
@@ -60,6 +62,17 @@ SCHEDULERS = (
     *("round-robin", "opportunistic", "max-aoi", "drift-plus-penalty", "whittle"),
     "innovation",
 )
+
+FLAGS_OF_LAWS = {  # of `scale`; all others mean something under each law
+    "--scheduler": ("scheduled",),
+    "--uncertainty": ("scheduled",),
+    "--power-margin-db": ("scheduled",),
+    "--coherence-slots": ("scheduled",),
+    "--seeds": ("scheduled",),
+    "--noise": ("equal",),
+    "--remeasure": ("duty", "equal"),
+    "--dataset": ("duty", "equal"),
+}
 
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 MAX_HARQ_ROUNDS = 16
@@ -128,13 +141,27 @@ def check_methods(methods: tuple[str, ...]) -> None:
     """Check method names.
 
     Raises:
-        UsageError: no name, or a name that no method has.
+        UsageError: no name, or a name that no method has (``ts-jepa-N`` is one for any depth N).
     """
     if not methods:
         raise UsageError(f"no method given; choose from {', '.join(METHODS)}")
     for method in methods:
-        if method not in METHODS:
+        if method not in METHODS and not ANY_DEPTH.fullmatch(method):
             raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
+
+
+def check_flags_of_law(law: str, given: Mapping[str, bool]) -> None:
+    """Check that flags of ``scale`` that were given mean something under its law.
+
+    Raises:
+        UsageError: naming the law that the flag is for.
+    """
+    for flag, laws in FLAGS_OF_LAWS.items():
+        if given[flag] and law not in laws:
+            raise UsageError(
+                f"{flag} is for the law {' or '.join(laws)}, this is {law}",
+                hint=f"hjepa scale --law {laws[0]} {flag} …, or leave out {flag}",
+            )
 
 
 def late(method: str, steps: int) -> str:
@@ -205,10 +232,10 @@ def _check_radio(radio: RadioSettings) -> None:
 def _check_number(key: str, value: float) -> None:
     if isinstance(value, int) and key not in ZERO_ALLOWED and value < 1:
         raise UsageError(f"{key} = {value}; expected at least 1")
+    if value <= 0 and key in POSITIVE:
+        raise UsageError(f"{key} = {value}; expected more than 0")
     if value < 0 and not key.startswith(NEGATIVE_ALLOWED):
         raise UsageError(f"{key} = {value}; expected at least 0")
-    if value == 0 and key in POSITIVE:
-        raise UsageError(f"{key} = {value}; expected more than 0")
     if value >= 1 and key in BELOW_ONE:
         raise UsageError(f"{key} = {value}; expected less than 1")
 

@@ -17,7 +17,7 @@ import typer
 from typer.main import get_command
 
 from hjepa_cli import __version__, options, plan, torchrun
-from hjepa_cli.checks import COMPARED
+from hjepa_cli.checks import COMPARED, check_flags_of_law
 from hjepa_cli.command import PipeClosed, Result, execute, guard, print_help, resolve
 from hjepa_cli.errors import DataError, HjepaError, StorageError, UsageError
 from hjepa_cli.plan import Plan
@@ -414,6 +414,17 @@ def scale(
         from hjepa_cli.core.capacity import parse_snr
 
         snr_db = parse_snr(settings.radio.snr_db)
+        given = {
+            "--scheduler": scheduler is not None,
+            "--uncertainty": uncertainty is not None,
+            "--power-margin-db": power_margin_db is not None,
+            "--coherence-slots": coherence_slots is not None,
+            "--seeds": seeds is not None,
+            "--noise": noise is not None,
+            "--remeasure": remeasure,
+            "--dataset": dataset is not None,
+        }
+        check_flags_of_law(settings.radio.law, given)
 
     def stage() -> Result:
         from hjepa_cli.stages.scale import run

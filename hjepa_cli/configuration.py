@@ -28,7 +28,7 @@ def show(
         settings: the resolved settings.
         config, flags: what they were resolved from, besides their preset.
         key: only this section or value.
-        as_toml: print a complete TOML file instead of a table.
+        as_toml: print a TOML file instead of a table, a complete one without ``key``.
 
     Raises:
         UsageError: no such section or value.
@@ -41,7 +41,7 @@ def show(
         sections = sorted({name.split(".")[0] for name in sources})
         raise UsageError(f"no setting or section '{key}'; choose from {', '.join(sections)}")
     if as_toml:
-        for line in to_toml(settings.as_dict()).splitlines():
+        for line in to_toml(_only(key, settings.as_dict())).splitlines():
             screen.result(line)
     else:
         screen.table(
@@ -53,6 +53,15 @@ def show(
         "preset": settings.preset,
         "values": {name: {"value": values[name], "from": sources[name]} for name in shown},
     }
+
+
+def _only(key: str, values: Mapping[str, Any]) -> Result:
+    """The settings with this section or value alone, and the preset that all are of."""
+    if not key:
+        return dict(values)
+    section, _, name = key.partition(".")
+    inside = values[section]
+    return {"preset": values["preset"], section: {name: inside[name]} if name else inside}
 
 
 def text(value: Any) -> str:

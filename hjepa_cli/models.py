@@ -127,6 +127,8 @@ def _row(model: Result) -> list[object]:
     if "error" in model:
         return [model["name"], f"damaged: {model['error']}", "", "", None, "", ""]
     strides = "/".join(str(stride) for stride in model["strides"].values() if stride is not None)
+    if model["kind"] == "flat":  # one level: its m and l are not there
+        strides = str(model["strides"]["h"])
     megabytes = f"{model['size_bytes'] / 1e6:.1f}"
     curves = "measured" if model["curves"] else "none"
     return [

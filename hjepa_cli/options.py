@@ -135,7 +135,7 @@ Encoder = Annotated[
     _plain(
         FILES,
         "--encoder",
-        "Encoder to build on: a zoo name or a path. Without it: that of the newest run.",
+        "Encoder to build on: a zoo name or a path. Without it: the newest run's, else the zoo's.",
         metavar="NAME|PATH",
         autocompletion=completion.models,
     ),

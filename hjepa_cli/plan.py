@@ -148,7 +148,8 @@ def plan_train_hierarchy(
         command="train-hierarchy",
         reads=[_dataset(dataset, settings), _encoder(encoder, settings)],
         work=[
-            f"render and encode about {frames} frames",
+            f"render and encode about {frames} frames, "
+            f"those for training {1 + options.shifted_copies} times",
             f"train {levels}, ts-jepa-1 and the actor ({steps} steps)",
         ],
         writes=[f"run {_run('train-hierarchy', out)}"],
@@ -157,7 +158,7 @@ def plan_train_hierarchy(
         + _seconds(
             {
                 "rendered frames": frames,
-                "encoded frames": 2 * frames,
+                "encoded frames": (2 + options.shifted_copies) * frames,
                 "level training steps": steps,
             }
         ),
@@ -420,4 +421,8 @@ def _look(find: Callable[[], Path | None]) -> Path | None:
 
 
 def _run(stage: str, out: Path | None) -> str:
+    if out is not None:
+        from hjepa_cli.storage.runs import check_ours
+
+        check_ours(out)
     return str(out or f"runs/{stage}/<next number>")

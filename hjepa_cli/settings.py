@@ -358,6 +358,9 @@ def _build(kind: type[T], values: Mapping[str, Any], prefix: str) -> T:
     return kind(**{name: _convert(hints[name], values[name], prefix + name) for name in hints})
 
 
+NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+
 def _convert(hint: Any, value: Any, name: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return _build(typing.cast(type, hint), value, f"{name}.")
@@ -374,7 +377,7 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) <= sys.float_info.max else math.inf
     if type(value) is not hint:
-        raise UsageError(f"{name} = {value!r}; expected {hint.__name__}")
+        raise UsageError(f"{name} = {value!r}; expected {NAMES[hint]}")
     if hint is float and not math.isfinite(value):
         raise UsageError(f"{name} = {value}; expected a finite number")
     return value

@@ -274,3 +274,10 @@ def test_a_reader_of_linear_embeddings_controls_as_well_as_the_teacher(
         sense = lambda seen: embed(model, seen)  # noqa: E731
         outcomes[gap] = simulate(DESKTOP, draws, schedule, controls, sense).score.mean()
     assert outcomes[1.0] > 0.8 and outcomes[20.0] > 0.7
+    # A link that adds noise of 0.1 to embeddings: the filter is told what that is in states.
+    noise = 0.1 * torch.randn(10_000, 12, generator=torch.Generator().manual_seed(1))
+    told = kalman.fit_state_reader(model, settings, lambda z: z + noise[: len(z)])
+    unmixed = np.linalg.pinv(mix.numpy().astype(float))
+    expected = 0.01 * unmixed.T @ unmixed
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert told.filter.noise / scale == pytest.approx(expected / scale, abs=0.15)

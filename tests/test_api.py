@@ -89,8 +89,12 @@ def test_drive_keeps_every_state_and_scores_like_eval():
     np.testing.assert_array_equal(perfect["states"], same["states"])
     never = hjepa_cli.drive("zero-true", delivery=0.0, devices=2, settings=QUICK)
     assert (never["forces_n"][1:] == 0).all()
+    late = hjepa_cli.drive("hold-true+9", devices=2, settings=QUICK)
+    assert (late["forces_n"][:9] == 0).all() and (late["forces_n"][9] != 0).all()
     with pytest.raises(UsageError):
         hjepa_cli.drive("oracle", gap_steps=3, delivery=0.5)
+    with pytest.raises(UsageError):
+        hjepa_cli.drive("oracle", gap_steps=0)
 
 
 def test_a_simulated_cell_is_the_stage_s():

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -94,9 +95,50 @@ def test_unknown_preset_lists_the_presets(shell, command):
 
 
 @pytest.mark.parametrize("command", ["eval", "scale"])
-@pytest.mark.parametrize("methods", ["hjepa,hjpea", "ts-jepa-9", "hold true"])
+@pytest.mark.parametrize("methods", ["hjepa,hjpea", "ts-jepa-0", "ts-jepa-x", "hold true"])
 def test_unknown_method_lists_the_methods(shell, command, methods):
     refused(shell, 2, command, "--methods", methods, says=METHODS)
+
+
+@pytest.mark.parametrize("command", ["train-encoder", "train-hierarchy", "eval", "scale"])
+def test_a_plan_refuses_the_folder_that_the_command_would(shell, command):
+    Path("foreign").mkdir()
+    Path("foreign/notes.txt").touch()
+    says = ["foreign is not empty", "notes.txt"]
+    refused(shell, 2, command, "--dry-run", "--out", "foreign", says=says)
+
+
+@pytest.mark.parametrize("key", ["hierarchy", "hierarchy.h", "seed"])
+def test_a_part_of_the_settings_as_toml(shell, key):
+    printed = tomllib.loads(shell("config", "show", key, "--toml").out)
+    everything = tomllib.loads(shell("config", "show", "--toml").out)
+    for name in key.split("."):
+        printed, everything = printed[name], everything[name]
+    assert printed == everything
+
+
+@pytest.mark.parametrize("command", ["eval", "scale"])
+def test_a_depth_that_nobody_trained_names_the_command_that_does(shell, command):
+    arguments = (command, "--checkpoint", "desktop-h4m2l1", "--methods", "ts-jepa-9")
+    refused(shell, 66, *arguments, says=["ts-jepa-9", "hjepa train-hierarchy --h 9"])
+
+
+@pytest.mark.parametrize(
+    ("law", "flags", "meant"),
+    [
+        ("duty", ["--seeds", "3"], "scheduled"),
+        ("duty", ["--scheduler", "round-robin"], "scheduled"),
+        ("equal", ["--power-margin-db", "3"], "scheduled"),
+        ("equal", ["--coherence-slots", "2"], "scheduled"),
+        ("equal", ["--uncertainty", "levels"], "scheduled"),
+        ("duty", ["--noise", "scaled"], "equal"),
+        ("scheduled", ["--remeasure"], "duty"),
+        ("scheduled", ["--dataset", "data"], "duty"),
+    ],
+)
+def test_a_flag_that_the_law_would_ignore_is_refused(shell, law, flags, meant):
+    says = [f"{flags[0]} is for the law {meant}", f"this is {law}", f"--law {meant}"]
+    refused(shell, 2, "scale", "--law", law, *flags, says=says)
 
 
 @pytest.mark.parametrize("methods", ["", ",", " , "])

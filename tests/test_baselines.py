@@ -314,5 +314,6 @@ def test_raw_frames_are_sent_whatever_the_payload(name: str, workplace: Path) ->
     assert controller.act(~everybody, None) == pytest.approx(expected, abs=1e-4)  # held
     late = build_method(f"{name}+3", settings(), model)
     assert late.delay_steps == 3 and late.family != method.family
+    assert late.name == f"{name}+3"  # by which its loops are driven
     with pytest.raises(UsageError, match="needs a model of it"):
         build_method("hjepa", settings(), model)

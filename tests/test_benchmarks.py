@@ -84,6 +84,21 @@ def test_the_training_step_is_measured_against_its_promises() -> None:
     assert "bare" in slow
 
 
+def test_the_closed_loop_is_timed_in_parts_and_as_a_whole(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    closed_loop = load("closed_loop")
+    timed = closed_loop.seconds
+    monkeypatch.setattr(closed_loop, "seconds", lambda work: timed(work, at_least_s=0.0))
+    arguments = ["closed_loop.py", "--checkpoint", "desktop-h4m2l1", "--devices=2", "--steps=2"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    closed_loop.main()
+    shown = capsys.readouterr().out
+    for name in ("hjepa", "ts-jepa-1", "hold", "oracle"):
+        assert re.search(rf"^{name} .*\d x at D = 80$", shown, re.MULTILINE), name
+    assert re.search(r"^hjepa .* 1\.25 million MACs", shown, re.MULTILINE)
+
+
 STUDIES = sorted((REPOSITORY / "benchmarks" / "studies").glob("*.toml"))
 
 

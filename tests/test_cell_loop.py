@@ -284,13 +284,16 @@ def test_growth_tells_controllers_apart():
 # --- Loads --------------------------------------------------------------------------------------
 
 
-def curve(crossing, calls, level=0.62):
-    """A stand-in for the simulation: the score falls through the level at ``crossing``."""
+def curve(crossing, calls, level=0.62, spread=0.01):
+    """A stand-in for the simulation: the score falls through the level at ``crossing``.
+
+    ``spread``: the devices' scores lie evenly within ± this.
+    """
 
     def simulate_load(load):
         calls.append(load)
         score = np.full(40, level + 0.004 * (crossing - load))
-        score += np.linspace(-0.01, 0.01, 40)
+        score += np.linspace(-spread, spread, 40)
         outcome = CellOutcome(score, score, np.full(40, 25), 100, 1000)
         return LoadPoint(load, 1, outcome, np.ones(40))
 
@@ -301,11 +304,36 @@ def curve(crossing, calls, level=0.62):
 def test_loads_are_found_in_eight_bisections(crossing):
     calls = []
     found = find_load(curve(crossing, calls), 0.62, 0.03, replicates=200, seed=0)
-    assert len(calls) == len(set(calls)) <= MAX_BISECTIONS
+    assert len(calls) == len(set(calls)) <= MAX_BISECTIONS + 2  # narrow: one more for each end
     assert found.load == pytest.approx(crossing, abs=1e-6)
     assert found.interval[0] < found.load < found.interval[1]
     assert not found.at_least
     assert found.packets_per_slot == 1.0 and found.reports_per_slot == 0.1
+
+
+@pytest.mark.parametrize("crossing", [100.05, 102.95])
+def test_both_ends_of_the_interval_are_simulated(crossing):
+    """A crossing close to a simulated load: draws of the devices cross outside the bracket."""
+    calls = []
+    found = find_load(curve(crossing, calls), 0.62, 0.03, replicates=5000, seed=0, start=100.0)
+    assert len(calls) == len(set(calls))
+    low, high = found.interval
+    # Scores spread evenly over ± 0.01, 40 devices, 0.004 per unit of load: ± 0.46.
+    assert crossing - low == pytest.approx(0.46, rel=0.1)
+    assert high - crossing == pytest.approx(0.46, rel=0.1)
+    assert min(calls) < low and high < max(calls)
+
+
+@pytest.mark.parametrize("spread", [0.2, 0.5])
+def test_a_wide_interval_is_not_cut_off_at_the_simulated_loads(spread):
+    """Devices that differ much: the ends are where the bootstrap of all of them has them."""
+    calls = []
+    found = find_load(
+        curve(100.0, calls, spread=spread), 0.62, 0.03, replicates=5000, seed=0, start=100.0
+    )
+    half = 1.96 * spread / math.sqrt(3) * math.sqrt(41 / 39) / math.sqrt(40) / 0.004
+    assert found.interval == pytest.approx((100 - half, 100 + half), rel=0.1)
+    assert min(calls) < found.interval[0] and found.interval[1] < max(calls)
 
 
 @pytest.mark.parametrize("start", [0.0, 1.0, 30.0, 41.5, 60.0, 500.0])

@@ -9,6 +9,7 @@ from hjepa_cli.core.conditions import Disturbed, actual_camera, actual_plant
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Block, Simulator
+from hjepa_cli.core.trajectories import generate
 from hjepa_cli.errors import UsageError
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.storage.curves import Digest
@@ -94,3 +95,18 @@ def test_digests_are_those_of_before_unless_conditions_changed() -> None:
         for conditions in ({}, {"light": 0.8}, {"camera_noise": 1.0}, {"pole_length": 0.9})
     }
     assert len(digests) == 4
+
+
+def test_rollouts_to_predict_are_of_the_devices_and_training_is_nominal() -> None:
+    nominal, longer = settings(), settings(pole_length=1.5)
+    rows = range(6)
+    for split in ("train", "test"):
+        same = [generate(options, split, rows).states for options in (nominal, longer)]
+        np.testing.assert_array_equal(*same)
+    one, other = (generate(options, "clean", rows) for options in (nominal, longer))
+    np.testing.assert_array_equal(one.states[:, 0], other.states[:, 0])
+    assert abs(one.states[:, 20] - other.states[:, 20]).max() > 0.01
+    now, devices = other.states[:, 1].astype(float), actual_plant(longer).simulation(6)
+    devices.states = now
+    devices.step(plant("desktop").teacher()(now))  # which does not know of the longer poles
+    np.testing.assert_allclose(devices.states, other.states[:, 2], atol=1e-5)

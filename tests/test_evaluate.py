@@ -25,7 +25,7 @@ from hjepa_cli.core.bench import Bench, control_entry, control_errors, errors_at
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.loop import Outcome
-from hjepa_cli.core.methods import embedding_method, true_state_method
+from hjepa_cli.core.methods import build_method, embedding_method, true_state_method
 from hjepa_cli.core.model import Model, build_modules, tensors_of
 from hjepa_cli.core.payload import quantise
 from hjepa_cli.core.plant import plant
@@ -383,6 +383,37 @@ def test_curves_of_another_digest_are_not_there(tmp_path: Path) -> None:
     assert curves.Digest.of("model", settings, dataset=settings.as_dict()) == digest
 
 
+@pytest.mark.parametrize(
+    "key", ["trajectories", "test_trajectories", "steps", "exploration_n", "exploration_hold_steps"]
+)
+def test_what_is_fitted_to_other_trajectories_is_measured_again(tmp_path: Path, key: str) -> None:
+    path, settings = tmp_path / "curves.json", small()
+    collect = settings.collect
+    more = dataclasses.replace(collect, **{key: getattr(collect, key) + 1})
+    other = dataclasses.replace(settings, collect=more)
+    digest, changed = (curves.Digest.of("model", one) for one in (settings, other))
+    curves.write(path, digest, {"hjepa": entry_of(0.5), "state-48": entry_of(0.4)})
+    assert sorted(curves.read(path, digest)) == ["hjepa", "state-48"]
+    assert list(curves.read(path, changed)) == ["hjepa"]  # fitted to nothing
+    coarse = [
+        dataclasses.replace(one, protocol=dataclasses.replace(one.protocol, payload="pca-4x4"))
+        for one in (settings, other)
+    ]
+    first, second = (curves.Digest.of("model", one) for one in coarse)
+    assert first.protocol != second.protocol  # components are fitted, whatever the method
+
+
+def test_late_packets_are_late_in_the_curves_too() -> None:
+    settings = small()
+    bench = Bench(settings.protocol, settings.seed, Simulator(settings, None))
+    prompt, late = (build_method(name, settings, None) for name in ("hold-true", "hold-true+9"))
+    found = {method.name: bench.curves(method).grid["gap"] for method in (prompt, late)}
+    points, outcome = found["hold-true+9"]
+    expected = bench.measure("hold-true+9", points, settings.protocol.curve_devices)
+    assert np.array_equal(outcome.cost, expected.cost)
+    assert not np.array_equal(outcome.cost, found["hold-true"][1].cost)
+
+
 def test_writing_keeps_the_same_digest_and_replaces_others(tmp_path: Path) -> None:
     path = tmp_path / "curves.json"
     digest, other = (curves.Digest.of(name, small()) for name in ("one", "two"))
@@ -424,7 +455,7 @@ def test_damaged_curves_are_refused_beside_a_model_and_passed_over_elsewhere(
     text: str, tmp_path: Path
 ) -> None:
     digest = curves.Digest.of("model", small())
-    text = text.replace("DIGEST", json.dumps(dataclasses.asdict(digest)))
+    text = text.replace("DIGEST", json.dumps(digest.as_dict()))
     beside, old = tmp_path / "curves.json", tmp_path / "eval" / "0001" / "curves.json"
     old.parent.mkdir(parents=True)
     beside.write_text(text)

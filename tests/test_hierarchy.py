@@ -70,11 +70,12 @@ def test_plan_stride_is_aligned(h: int, m: int, l: int) -> None:
     assert torch.equal(embeddings[..., 0], z[:, :1].expand(-1, h // l))
     assert torch.equal(actions, fine_steps.repeat_interleave(l, dim=1))  # held off the finest grid
     assert torch.equal(z_next, z + torch.tensor([0.0, float(h)]))
-    assert coarse.calls == 2
+    assert coarse.calls == 3
 
 
 def test_anchor_is_recomputed_with_the_played_actions() -> None:
     seen: list[Tensor] = []
+    expected: list[Tensor] = []
 
     def coarse(
         z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
@@ -82,22 +83,88 @@ def test_anchor_is_recomputed_with_the_played_actions() -> None:
         seen.append(actions)
         return z + torch.tensor([0.0, 4.0])
 
+    def medium(
+        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+    ) -> Tensor:
+        expected.append(actions)
+        return z + torch.tensor([0.0, 2.0])
+
     z = torch.tensor([[0.0, 8.0]])
-    for recompute, calls in ((True, 2), (False, 1)):
+    held, answered = torch.full((1, 4), 8.0), torch.tensor([[8.0, 9.0, 10.0, 11.0]])
+    for recompute, plays in ((True, [held, answered, answered]), (False, [held])):
         seen.clear()
+        expected.clear()
         played, _, _ = plan_stride(
             lambda state: state[:, 1],
             coarse,
-            Clock(2, exact_actions=False),
+            medium,
             Clock(1, exact_actions=False),
             z,
             Strides(4, 2, 1),
             recompute_anchor=recompute,
         )
-        assert len(seen) == calls
-        assert torch.equal(seen[0], torch.full((1, 4), 8.0))
-        assert torch.equal(played, torch.tensor([[8.0, 9.0, 10.0, 11.0]]))
-        assert torch.equal(seen[-1], played if recompute else seen[0])
+        assert torch.equal(played, answered)
+        assert torch.equal(torch.cat(seen), torch.cat(plays))
+        assert torch.equal(torch.cat(expected), torch.cat(plays[:2])[:, :2])
+
+
+def test_the_medium_level_starts_from_the_action_of_its_own_step() -> None:
+    """Spec: P^M([z_b, z_{a+h}], u_b); in the second pass it knows what was played from b on."""
+    seen: list[Tensor] = []
+
+    def medium(
+        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+    ) -> Tensor:
+        seen.append(actions)
+        return z + torch.tensor([0.0, 2.0])
+
+    for recompute in (False, True):
+        seen.clear()
+        plan_stride(
+            lambda state: state[:, 1],
+            Clock(8, exact_actions=False),
+            medium,
+            Clock(1, exact_actions=False),
+            torch.tensor([[0.0, 0.0]]),
+            Strides(8, 2, 1),
+            recompute_anchor=recompute,
+        )
+        first, again = [[0, 0], [2, 2], [4, 4]], [[0, 1], [2, 3], [4, 5]]
+        assert [actions[0].tolist() for actions in seen] == first + again * recompute
+
+
+def test_planning_again_shrinks_the_error_of_a_held_action() -> None:
+    """Scalar plant z' = g z + u under u = -c z, P^H exact, P^M sure that c drives to the anchor:
+    the anchor of a held action leads it astray, and planning again cuts that by c / (g - c)."""
+    g, c = 1.2, 0.3
+
+    def coarse(
+        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+    ) -> Tensor:
+        for action in actions.T:
+            z = g * z + action[:, None]
+        return z
+
+    def medium(
+        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+    ) -> Tensor:
+        assert anchor is not None
+        return anchor / (g - c)
+
+    z, errors = torch.tensor([[1.0]]), []
+    for recompute in (False, True):
+        played, _, z_next = plan_stride(
+            lambda state: -c * state[:, 0],
+            coarse,
+            medium,
+            coarse,
+            z,
+            Strides(2, 1, 1),
+            recompute_anchor=recompute,
+        )
+        errors.append(float(played[0, 1]) + c * (g - c))
+        assert torch.equal(z_next, coarse(z, played if recompute else played[:, :1].expand(-1, 2)))
+    assert errors[1] == pytest.approx(-c / (g - c) * errors[0], rel=1e-4)
 
 
 @pytest.mark.parametrize(("h", "m", "l"), [s for s in NESTED if s[0] <= 12])

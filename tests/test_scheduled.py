@@ -125,7 +125,7 @@ def test_margins_of_a_hall_by_hand(stage, monkeypatch):
     monkeypatch.setattr(scheduled_cell, "simulate_cell", simulate_cell)
     stage("zero-true", schedulers=["max-aoi"], topology="hall", snr_db="10,20")
     noise_dbm = -174 + 10 * math.log10(20e6) + 6
-    drop = drop_devices("InF-SH", 3.75, 100, 0)
+    drop = drop_devices("InF-SH", 3.75, 300, 0)
     devices, access = seen[-1]  # of the last SNR
     expected = 23 - (20 + noise_dbm + drop.loss_db[:devices])
     assert access.margin_db == pytest.approx(expected, abs=1e-6)

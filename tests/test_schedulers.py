@@ -135,7 +135,6 @@ def view(**changes):
         "power": np.array([0.2, 0.05, 10.0, 0.1, 0.03]),
         "queue": np.zeros(count),
         "reported": np.array([0.0, 0.1, 0.9, 0.3, 0.0]),
-        "reported_age": np.array([0, 8, 2, 9, 0]),
         "growth": geometric(1.1),
         "doubt": np.ones(count),
     }
@@ -160,7 +159,7 @@ def test_who_wins(name, order):
 
 def test_drift_plus_penalty_is_algorithm_2():
     age, queue, power = np.array([40, 40, 9, 60]), np.array([0.0, 3.0, 0.0, 7.0]), [0.5, 1, 1, 1.1]
-    known = {key: np.ones(4, int) for key in ("waited", "reported_age", "doubt")}
+    known = {key: np.ones(4, int) for key in ("waited", "doubt")}
     scores = SCHEDULERS["drift-plus-penalty"](
         View(
             age=age,
@@ -193,7 +192,6 @@ def test_age_value_and_whittle_agree_for_equal_loops(ages, a, blocks, seed):
         gain=none,
         queue=none,
         reported=none,
-        reported_age=np.ones(len(ages), int),
         waited=np.ones(len(ages), int),
         doubt=np.ones(len(ages)),
         growth=geometric(a, 400),

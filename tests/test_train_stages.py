@@ -161,6 +161,17 @@ def test_the_companion_is_the_start_of_the_high_level_where_h_agrees(workplace: 
     started = networks(workplace / "from-companion")["high"].state_dict()
     for name, tensor in source["high"].state_dict().items():
         assert torch.equal(started[name], tensor), name
+    # The P^H of a hierarchy is trained already: on its encoder another one starts from nothing.
+    again = train_hierarchy.run(
+        settings(**frozen),
+        QUIET,
+        dataset=workplace / "data",
+        encoder=str(workplace / "from-companion"),
+        out=workplace / "on-a-trained-one",
+    )
+    assert again["method"] == "hjepa"
+    fresh = networks(workplace / "on-a-trained-one")["high"].state_dict()
+    assert not any(torch.equal(fresh[name], started[name]) for name in fresh if "weight" in name)
 
 
 def test_an_interrupted_run_starts_again_and_ends_the_same(workplace: Path) -> None:

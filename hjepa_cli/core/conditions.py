@@ -46,8 +46,9 @@ class Disturbed:
         camera: what it would show.
         light: factor on all values; clipped at white.
         noise: standard deviation in steps of 8-bit values.
-        seed: of the noise, which is a function of the states besides: it does not depend on which
-            process renders them, or in what order.
+        seed: of the noise, which is a function of the states rendered together besides. It does not
+            depend on which process renders them or when, but on who else is in the picture's batch:
+            methods that send at other times do not share it.
     """
 
     def __init__(self, camera: Camera, light: float, noise: float, seed: int) -> None:

@@ -116,9 +116,10 @@ def plan_stride(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Play one coarse stride from its anchor, the controller's only work inside a gap.
 
-    The coarse prediction is first made with the anchor's action held; the finer levels then fill
-    in embeddings and their own actions; finally the anchor is predicted again with those actions
-    and the next stride starts there.
+    The next anchor is first predicted with the first action held; the finer levels then fill in
+    embeddings and the actions that answer them. Where a held action leads far from where these
+    actions lead, the finer levels were misled: so the anchor is predicted again and the stride
+    played once more. With what was played last, P^H predicts where the next stride starts.
 
     Args:
         act: embeddings [N, D] → actions [N, *A].
@@ -131,26 +132,52 @@ def plan_stride(
         Actions [N, h, *A]; embeddings [N, h / l, D] on the finest grid they were taken at;
         the next anchor [N, D].
     """
-    h, m, l = strides.h, strides.m, strides.l
     first = act(z)
-    anchor = coarse(z, hold(first, h))
-    embeddings, actions = [], []
-    z_b, action_b = z, first
-    for left in range(h // m, 0, -1):
-        z_next = anchor if left == 1 else medium(z_b, hold(action_b, m), anchor, left)
-        z_c, action_c = z_b, action_b
-        for remaining in range(m // l, 0, -1):
-            embeddings.append(z_c)
-            actions.append(hold(action_c, l))
-            if remaining > 1:
-                z_c = low(z_c, hold(action_c, l), z_next, remaining)
-                action_c = act(z_c)
-        if left > 1:
-            z_b, action_b = z_next, act(z_next)
-    played = torch.cat(actions, dim=1)
+    anchor = coarse(z, hold(first, strides.h))
+    actions, embeddings = play_stride(act, medium, low, z, anchor, first, strides)
     if recompute_anchor:
-        anchor = coarse(z, played)
-    return played, torch.stack(embeddings, dim=1), anchor
+        anchor = coarse(z, actions)
+        actions, embeddings = play_stride(act, medium, low, z, anchor, first, strides, actions)
+        anchor = coarse(z, actions)
+    return actions, embeddings, anchor
+
+
+def play_stride(
+    act: Callable[[Tensor], Tensor],
+    medium: Step,
+    low: Step,
+    z: Tensor,
+    anchor: Tensor,
+    first: Tensor,
+    strides: Strides,
+    expected: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Fill the stride between two anchors: embeddings, and the actions that answer them.
+
+    Args:
+        act, medium, low, strides: as for :func:`plan_stride`.
+        z, anchor: embeddings [N, D] at both ends.
+        first: action [N, *A] that answers ``z``.
+        expected: actions [N, h, *A] of the stride, if it was played before: P^M takes its strides
+            to be under these, otherwise under the action at their beginning, held.
+
+    Returns:
+        Actions [N, h, *A]; embeddings [N, h / l, D].
+    """
+    h, m, l = strides.h, strides.m, strides.l
+    actions, embeddings = [], []
+    for begin in range(0, h, m):
+        left, action = (h - begin) // m, act(z) if begin else first
+        under = hold(action, m) if expected is None else expected[:, begin : begin + m]
+        z_next = anchor if left == 1 else medium(z, under, anchor, left)
+        for remaining in range(m // l, 0, -1):
+            embeddings.append(z)
+            actions.append(hold(action, l))
+            if remaining > 1:
+                z = low(z, actions[-1], z_next, remaining)
+                action = act(z)
+        z = z_next
+    return torch.cat(actions, dim=1), torch.stack(embeddings, dim=1)
 
 
 def hold(action: Tensor, steps: int) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 from hjepa_cli.core.health import fit_probe, read_probe
 from hjepa_cli.core.loop import STATE_LIMIT, noise_per_step
 from hjepa_cli.core.system import Bools, Floats, Teacher
-from hjepa_cli.core.typical import Typical, typical
+from hjepa_cli.core.typical import typical
 from hjepa_cli.settings import Settings
 
 if TYPE_CHECKING:
@@ -152,16 +152,19 @@ class StateReader:
 
 
 @functools.lru_cache(maxsize=1)  # both anchors of a model share it
-def fit_state_reader(model: "Model", settings: Settings) -> StateReader:
+def fit_state_reader(
+    model: "Model", settings: Settings, send: Callable[[Tensor], Tensor] = lambda z: z
+) -> StateReader:
     """Fit decoder and filter to the training trajectories of the settings.
 
-    The measurement noise is the decoder's error on the held-out trajectories. The process noise is
+    The measurement noise is the decoder's error on the held-out trajectories, whose embeddings
+    [n, D] it gets as ``send`` makes them arrive. The process noise is
     what the identified dynamics leave unexplained and, since trajectories for training have none,
     the noise of the protocol, which no other method is told.
     """
     train, test = (typical(model, settings, split) for split in ("train", "test"))
     weights = fit_probe(train.z.flatten(0, 1), torch.from_numpy(train.states).flatten(0, 1))
-    decoded, held_out = (_decode(weights, data) for data in (train, test))
+    decoded, held_out = _decode(weights, train.z), _decode(weights, _sent(test.z, send))
     error = (held_out - test.states).reshape(-1, test.states.shape[2])
     a, b, c, unexplained = identify(decoded, train.actions)
     gusts = np.diag(noise_per_step(settings.protocol) ** 2)
@@ -192,7 +195,12 @@ def identify(states: Floats, actions: Floats) -> tuple[Floats, Floats, Floats, F
     return a, b, c[:, 0], rest.T @ rest / len(rest)
 
 
-def _decode(weights: Tensor, data: Typical) -> Floats:
+def _sent(z: Tensor, send: Callable[[Tensor], Tensor]) -> Tensor:
+    """Embeddings [N, T, D] as they arrive."""
+    return send(z.flatten(0, 1)).reshape(z.shape)
+
+
+def _decode(weights: Tensor, z: Tensor) -> Floats:
     """Decoded states [N, T, S]."""
-    read = read_probe(weights, data.z.flatten(0, 1))
-    return np.asarray(read.reshape(*data.z.shape[:2], -1).numpy())
+    read = read_probe(weights, z.flatten(0, 1))
+    return np.asarray(read.reshape(*z.shape[:2], -1).numpy())

@@ -24,7 +24,7 @@ from hjepa_cli.core.system import Bools, Floats, System
 from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.settings import ProtocolSettings
 
-LOOP_VERSION = 2  # raise it whenever a measured number changes: cached curves then expire
+LOOP_VERSION = 4  # raise it whenever a measured number changes: cached curves then expire
 STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
 _DRAWS_KEY = 0xD4A5
 

@@ -71,7 +71,9 @@ def build_method(name: str, settings: Settings, model: "Model | None") -> Method
     """
     name, steps = split_late(name)
     method = _build_method(name, settings, model)
-    return dataclasses.replace(method, family=late(method.family, steps), delay_steps=steps)
+    return dataclasses.replace(
+        method, name=late(name, steps), family=late(method.family, steps), delay_steps=steps
+    )
 
 
 def _build_method(name: str, settings: Settings, model: "Model | None") -> Method:
@@ -170,13 +172,15 @@ def local_method(model: "Model", camera: Camera | None = None) -> Method:
 
 def filtered_method(name: str, model: "Model", settings: Settings) -> Method:
     """``state-kf`` decodes states at the controller, ``state-48`` on the device."""
-    reader, kind = fit_state_reader(model, settings), plant(model.plant_name)
+    kind = plant(model.plant_name)
     controls = kind.teacher(), kind.force_limit_n
     if name == "state-kf":
         codec = build_codec(settings.protocol.payload, model, settings)
+        reader = fit_state_reader(model, settings, codec.send)
         build = functools.partial(KalmanController, reader.filter, reader.read, *controls)
         received = embedding_sensor(model, codec, actual_camera(settings))
         return Method(name, received, build, build, codec.bits, name)
+    reader = fit_state_reader(model, settings)
     fresh = embedding_sensor(model, None, actual_camera(settings))
     build = functools.partial(KalmanController, reader.quantised, np.asarray, *controls)
     sensor: Sensor = lambda seen: reader.codec.send(reader.read(fresh(seen)))  # noqa: E731

@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 BLOCK_DEVICES = 200  # simulated at a time, about
 MAX_LOAD = 512
 MAX_BISECTIONS = 8
+WIDER = 1.15  # how far outside to look for an end of the interval
+MAX_WIDENINGS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +94,8 @@ def find_load(
 ) -> SupportedLoad:
     """Bisect the load on a logarithmic scale, at most 8 times.
 
+    Where an end of the interval lies beyond the loads of the search, others are simulated there.
+
     Args:
         simulate: a load in 1 … :data:`MAX_LOAD`.
         level: the acceptable score.
@@ -122,7 +126,17 @@ def find_load(
         both = low in points and high in points
         if both and (high - low <= 1 or high / low <= 1 + bracket):
             break
-    return _crossing([points[load] for load in sorted(points)], level, replicates, seed)
+
+    def crossings() -> tuple[float, float, float]:
+        return _crossings([points[load] for load in sorted(points)], level, replicates, seed)
+
+    for _ in range(MAX_WIDENINGS):
+        crossing, least, most = crossings()
+        outside = [round(min(points) / WIDER)] * math.isinf(least)
+        outside += [round(max(points) * WIDER)] * math.isinf(most)
+        outside = [load for load in outside if math.isfinite(crossing) and 1 <= load <= MAX_LOAD]
+        points |= {load: simulate(load) for load in outside}
+    return _supported([points[load] for load in sorted(points)], *crossings())
 
 
 def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
@@ -153,10 +167,13 @@ def pooled_score(
     return float(metrics.ratio(score, reference)), (float(low), float(high))
 
 
-def _crossing(
+def _crossings(
     points: Sequence[LoadPoint], level: float, replicates: int, seed: int
-) -> SupportedLoad:
-    """Interpolate the load between the simulated ones, and bootstrap it over devices."""
+) -> tuple[float, float, float]:
+    """Interpolate the load between the simulated ones; the 95 % interval over devices.
+
+    −∞ and ∞ where the score is below the level at the least load, above it at the largest.
+    """
     loads = np.array([point.load for point in points], np.float64)
     scores = np.array([point.score for point in points])
     most = max(len(point.reference) for point in points)
@@ -168,13 +185,20 @@ def _crossing(
         ],
         axis=-1,
     )
-    crossing = float(metrics.first_crossing(loads, scores, level, log=False))
+    crossing = metrics.first_crossing(loads, scores, level, log=False)
     low, high = metrics.interval(metrics.first_crossing(loads, drawn, level, log=False))
+    return float(crossing), float(low), float(high)
+
+
+def _supported(
+    points: Sequence[LoadPoint], crossing: float, low: float, high: float
+) -> SupportedLoad:
+    """What was found between the simulated loads, in numbers that can be multiplied."""
     inside = [point for point in points if point.load <= crossing] or points[:1]
-    ends = {-math.inf: 0.0, math.inf: float(loads[-1])}
+    ends = {-math.inf: 0.0, math.inf: float(points[-1].load)}
     return SupportedLoad(
         load=ends.get(crossing, crossing),
-        interval=(ends.get(float(low), float(low)), ends.get(float(high), float(high))),
+        interval=(ends.get(low, low), ends.get(high, high)),
         at_least=crossing == math.inf,
         packets_per_slot=inside[-1].packets_per_slot,
         reports_per_slot=inside[-1].reports_per_slot,

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hjepa_cli.core.conditions import actual_plant
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.system import Floats
@@ -27,7 +28,7 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
 
     One step without force leads from the drawn state to k = 0, because the camera needs a frame
     before it. The applied force is the teacher's plus exploration, clipped; the label is the
-    teacher's alone. ``clean`` has no exploration.
+    teacher's alone. ``clean`` has no exploration, and devices as ``conditions`` have them.
 
     Args:
         settings: plant, seed and ``collect``.
@@ -44,7 +45,8 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     draws = [_draw(settings, split, i, steps) for i in rows]
     initial, exploration_n = (np.stack(parts) for parts in zip(*draws, strict=True))
 
-    force_n, world = kind.teacher(), kind.simulation(count)
+    moved = actual_plant(settings) if split == "clean" else kind  # what methods are measured on
+    force_n, world = kind.teacher(), moved.simulation(count)
     world.states = initial
     states = np.empty((count, steps + 1, len(kind.state_names)))
     applied_n, teacher_n = np.empty((2, count, steps, *kind.action_shape))

@@ -107,7 +107,6 @@ class Uplink:
         self._waited = np.arange(devices, 0, -1)
         self._queue = np.zeros(devices)
         self._reported = np.zeros(devices)
-        self._reported_age = np.zeros(devices, dtype=np.int64)
         self._doubt = np.ones(devices)
         # Copies that were lost of the sample a device is repeating, and slots since it was taken.
         self._lost = np.zeros(devices, dtype=np.int64)
@@ -148,7 +147,6 @@ class Uplink:
         tells = (innovation >= self._delta) & ((level + 0.5) / levels >= REPORT_AGAIN * known)
         who = np.flatnonzero(devices)[tells]
         self._reported[who] = (level[tells] + 0.5) / levels
-        self._reported_age[who] = self._age[who]
         self.reports += len(who)
         # The other devices look in other slots: this slot's reports are its share of all.
         excess = len(who) / self._access.blocks - REPORTS_PER_BLOCK
@@ -167,7 +165,6 @@ class Uplink:
             power=self._power,
             queue=self._queue,
             reported=self._reported,
-            reported_age=self._reported_age,
             growth=self._access.growth,
             doubt=self._doubt,
         )
@@ -182,7 +179,6 @@ class Uplink:
         self._age = np.where(arrived, self._behind, self._age) + 1
         self._behind = np.where(self._lost > 0, self._behind + 1, 0)
         self._reported[arrived] = 0.0
-        self._reported_age[arrived] = 0
         self._slot += 1
         return arrived
 

@@ -63,7 +63,8 @@ def run(
 
     Raises:
         UsageError: unknown method.
-        MissingInputError: no such checkpoint or dataset, or no matplotlib for ``figure``.
+        MissingInputError: no such checkpoint or dataset, no model of any of the methods, or no
+            matplotlib for ``figure``.
         DataError: a damaged file, one of another plant, or a figure of models of different seeds.
     """
     check_methods(settings.methods)
@@ -72,6 +73,7 @@ def run(
             "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
         )
     subject = open_subject(settings, screen, checkpoint, dataset, further, one_seed=figure)
+    subject.check_any(settings.methods)
     if figure:
         subject.check_one_training_seed()
     inputs = subject.inputs(remeasure=remeasure)

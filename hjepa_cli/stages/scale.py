@@ -16,7 +16,7 @@ from hjepa_cli.core.capacity import late_slots, parse_snr, slot_capacity
 from hjepa_cli.core.cell import Cell, Need, Row, best_flat, gain
 from hjepa_cli.core.methods import FRAME_BITS
 from hjepa_cli.core.plant import plant
-from hjepa_cli.errors import MissingInputError, NumericalError
+from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.evaluate import curves_for, measure_points
@@ -68,11 +68,7 @@ def run(
         return run_scheduled(settings, screen, checkpoint, out, verify, further)
     grid_db = parse_snr(settings.radio.snr_db)
     subject = open_subject(settings, screen, checkpoint, dataset, further)
-    skipped = subject.skipped(settings.methods)
-    if len(skipped) == len(settings.methods):
-        raise MissingInputError(
-            f"no model for {', '.join(skipped)}", hint=next(iter(skipped.values()))
-        )
+    subject.check_any(settings.methods)
     level = settings.protocol.acceptable_score
     inputs = subject.inputs(remeasure=remeasure, verify=verify)
     with Run.create("scale", out, settings.as_dict(), inputs) as record:
@@ -105,7 +101,7 @@ def run(
             "rows": rows,
             "gains": gains(rows, at_db),
             "paper_gain_percent": PAPER_GAIN_PERCENT,
-            "skipped": skipped,
+            "skipped": subject.skipped(settings.methods),
         }
         result["csv"] = write_csv(record.path("devices.csv"), rows)
         result["figures"] = draw(result, record.directory, screen)

@@ -13,7 +13,7 @@ from typing import Any
 from hjepa_cli.checks import ANCHORS, RAW_FRAMES, TRUE_STATE, split_late
 from hjepa_cli.core.model import Model, offered
 from hjepa_cli.core.plant import plant, plant_of
-from hjepa_cli.errors import DataError, HjepaError
+from hjepa_cli.errors import DataError, HjepaError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage import runs, zoo
@@ -123,6 +123,18 @@ class Subject:
         """The methods without a model, with what would train it."""
         missing = [name for name in methods if name not in self.methods]
         return {name: how_to_train(name, self.settings) for name in missing}
+
+    def check_any(self, methods: Sequence[str]) -> None:
+        """Check that there is a model of at least one of them.
+
+        Raises:
+            MissingInputError: naming all of them, and what trains the first.
+        """
+        skipped = self.skipped(methods)
+        if len(skipped) == len(methods):
+            raise MissingInputError(
+                f"no model for {', '.join(skipped)}", hint=next(iter(skipped.values()))
+            )
 
     def say_skipped(self, methods: Sequence[str], screen: Screen) -> None:
         """Tell the user about them."""

@@ -100,8 +100,8 @@ def run(
         modules = build_modules(architecture, kind.action_shape, kind.force_signs)
         modules["encoder"].load_state_dict(trained["encoder"].state_dict())
         modules["encoder"].requires_grad_(False).eval()
-        started = "high" in trained and "high" in modules
-        if started and source.metadata["architecture"]["h"] == strides.h:
+        begun = source.metadata["architecture"]  # an encoder comes with a P^H, begun beside it
+        if "high" in modules and (begun["kind"], begun["h"]) == ("encoder", strides.h):
             modules["high"].load_state_dict(trained["high"].state_dict())
         shared = [name for name in SHARED if trained_alike(source, data, settings)]
         for name in shared:

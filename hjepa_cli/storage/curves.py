@@ -2,7 +2,8 @@
 
 ``curves.json`` holds one entry per method, exactly as ``eval --json`` prints it, under a digest of
 the checkpoint, of the protocol and of the code's version of the closed loop. An entry is reused
-where all three agree; otherwise it counts as not there.
+where all three agree, and of an anchor where it was fitted to the same trajectories besides;
+otherwise it counts as not there.
 """
 
 import contextlib
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli.checks import ANCHORS
 from hjepa_cli.core.loop import LOOP_VERSION
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.settings import Settings
@@ -36,6 +38,7 @@ CLEAN = (  # settings of ``collect`` that clean rollouts depend on
     "theta_rad",
     "theta_dot_rad_s",
 )
+FITTED = ("trajectories", "test_trajectories", "steps", "exploration_n", "exploration_hold_steps")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,11 +48,14 @@ class Digest:
     Attributes:
         checkpoint: sha256 of the model; ``None`` without one (true-state methods alone).
         protocol: sha256 of everything else that a user can set.
+        fitted: sha256 of what the trajectories depend on that anchors are fitted to, beside the
+            settings in ``protocol``. It concerns these methods alone.
         loop_version: :data:`hjepa_cli.core.loop.LOOP_VERSION`.
     """
 
     checkpoint: str | None
     protocol: str
+    fitted: str = ""
     loop_version: int = LOOP_VERSION
 
     @classmethod
@@ -93,8 +99,14 @@ class Digest:
         }
         if changed:  # or digests would not be those of before there were conditions
             measured["conditions"] = changed
-        text = files.canonical_json(measured)
-        return cls(checkpoint, hashlib.sha256(text.encode()).hexdigest())
+        fitted = [values["collect"][key] for key in FITTED]
+        if values["protocol"]["payload"].startswith("pca"):  # components are fitted to them, too
+            measured["fitted"] = fitted
+        return cls(checkpoint, _sha256(measured), _sha256(fitted))
+
+    def as_dict(self) -> dict[str, Any]:
+        """As it stands in a file, for all of its methods."""
+        return {name: value for name, value in vars(self).items() if name != "fitted"}
 
 
 def read(path: Path, digest: Digest) -> dict[str, Entry]:
@@ -110,12 +122,16 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
     files.check_schema(document.get("schema"), SCHEMA, str(path))
     if not isinstance(document.get("methods"), dict):
         raise _damaged(path, "no methods")
-    if document.get("digest") != dataclasses.asdict(digest):
+    if document.get("digest") != digest.as_dict():
         return {}
     for name, entry in document["methods"].items():
         if reason := flaw(entry):
             raise _damaged(path, f"method '{name}': {reason}")
-    return dict(document["methods"])
+    return {
+        name: entry
+        for name, entry in document["methods"].items()
+        if name not in ANCHORS or entry.get("fitted_to") == digest.fitted
+    }
 
 
 def find(
@@ -163,8 +179,14 @@ def write(path: Path, digest: Digest, entries: Mapping[str, Entry]) -> None:
         with contextlib.suppress(DataError):  # damaged curves are replaced like foreign ones
             kept = read(path, digest)
         methods = files.jsonable(kept | dict(entries))
-        document = {"schema": SCHEMA, "digest": dataclasses.asdict(digest), "methods": methods}
+        for name in methods.keys() & set(ANCHORS):
+            methods[name]["fitted_to"] = digest.fitted
+        document = {"schema": SCHEMA, "digest": digest.as_dict(), "methods": methods}
         files.write_json(path, document)
+
+
+def _sha256(value: object) -> str:
+    return hashlib.sha256(files.canonical_json(value).encode()).hexdigest()
 
 
 def _newest_first(*stages: Path) -> list[Path]:

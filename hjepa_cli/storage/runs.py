@@ -87,7 +87,7 @@ class Run:
         else:
             directory = out
             files.make_directory(directory)
-            _refuse_foreign(directory)
+            check_ours(directory)
         run = cls(directory, files.lock_directory(directory))
         run._track = track(directory) if track else None
         try:
@@ -330,7 +330,12 @@ def environment(
     }
 
 
-def _refuse_foreign(directory: Path) -> None:
+def check_ours(directory: Path) -> None:
+    """Check that a directory, if it is there, is empty or a run.
+
+    Raises:
+        UsageError: it holds something else.
+    """
     entries = files.list_names(directory)
     for name in entries if CONFIG not in entries else ():
         if name not in (files.LOCK_FILE, ENVIRONMENT) and not files.is_temporary(name):

@@ -15,8 +15,10 @@ UNTOLD = 1e-6  # of what devices without a report may err by: they come after al
 
 
 def score(view: View) -> NDArray[np.float64]:
-    """The reported e², grown since; a little for what devices without a report have come to."""
-    now = view.growth.at(view.age)
-    grown = now / view.growth.at(np.maximum(view.reported_age, 1))
-    value = view.reported**2 * grown + UNTOLD * now * view.doubt
+    """The reported e²; a little for what devices without a report have come to.
+
+    What has become of an error since its report is not guessed: one that has doubled is reported
+    again, and one that has waited long is often of a loop that is out of its band anyway.
+    """
+    value = view.reported**2 + UNTOLD * view.growth.at(view.age) * view.doubt
     return np.where(view.able, value, 0.0)

@@ -21,7 +21,6 @@ class View:
         power: transmit power that the target SNR takes now ÷ the power limit.
         queue: Q, virtual queue of ages beyond the target (drift-plus-penalty).
         reported: last reported innovation since the newest sample, 0 without a report.
-        reported_age: A when it was reported.
         growth: how the control error grows with age, of each device's controller.
         doubt: what a device's own uncertainty is of f at its age; 1 where only the age is known.
     """
@@ -32,7 +31,6 @@ class View:
     power: Floats
     queue: Floats
     reported: Floats
-    reported_age: NDArray[np.int64]
     growth: Growth
     doubt: Floats
 
