@@ -258,11 +258,14 @@ def plan_view(
     settings: Settings, checkpoint: str | None, out: Path, devices: int, *, live: bool
 ) -> Plan:
     """Plan of ``hjepa view``."""
+    from hjepa_cli.stages.view import open_viewable
+
+    subject = open_viewable(settings, Screen(quiet=True), checkpoint)
     steps, methods = settings.protocol.steps, settings.methods
     frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
     return Plan(
         command="view",
-        reads=[f"model {_subject(settings, checkpoint, None).name}"],
+        reads=[f"model {subject.name}"],
         work=[
             "fit a linear probe of the state on embeddings",
             f"drive {devices} devices for {steps} steps with {', '.join(methods)}",

@@ -284,7 +284,9 @@ def test_dry_run_says_what_would_be_drawn(shell, checkpoint):
 def test_what_cannot_be_viewed_is_refused(shell, checkpoint):
     small = ["--checkpoint", checkpoint, "--config", "small.toml", "--quiet"]
     with shell.untouched():
-        assert_one_line_error(shell("view", "--methods", "oracle", *small), 2, "oracle", "hjepa")
+        oracle = ["view", "--methods", "oracle", *small]
+        assert_one_line_error(shell(*oracle), 2, "oracle", "hjepa")
+        assert_one_line_error(shell(*oracle, "--dry-run"), 2, "oracle", "hjepa")
         assert_one_line_error(shell("view", "--out", "a.avi", *small), 2, ".avi", ".mp4")
         assert_one_line_error(shell("view", "--live", *small), 2, "terminal")
         assert_one_line_error(shell("view", "--delivery", "0", *small), 2, "--delivery")

@@ -15,9 +15,6 @@ from hjepa_cli.errors import UsageError
 
 FloatArray = npt.NDArray[np.float64]
 
-CRC_BITS = (
-    24  # TS 38.212, clause 5.1: CRC24 of transport blocks above 3,824 bits and of LDPC blocks
-)
 LONGEST_USES = 1e12
 
 

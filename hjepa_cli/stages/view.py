@@ -6,7 +6,6 @@ SNR and the age of the last packet. It shows a handful of devices; numbers come 
 """
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from hjepa_cli.core.trajectories import generate
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.subject import open_subject
+from hjepa_cli.stages.subject import Subject, open_subject
 from hjepa_cli.storage import files
 
 FADING_KEY = 0xFAD1
@@ -151,12 +150,7 @@ def run(
         files.make_directory(out.parent)
     elif not screen.is_terminal:
         raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
-    subject = open_subject(settings, screen, checkpoint, None)
-    if subject.model is None:
-        train = f"hjepa reproduce --preset {settings.preset}"
-        raise MissingInputError(f"no model of plant {settings.plant}", hint=train)
-    check_methods(settings.methods, subject.model)
-
+    subject = open_viewable(settings, screen, checkpoint)
     link = make_link(settings, subject.model, devices, snr_db, delivery, gap_steps)
     screen.say(link.label)
     probe = fit_probe(settings, subject.model, screen)
@@ -195,15 +189,25 @@ def belief_errors(shot: Film, kind: System) -> dict[str, float]:
     }
 
 
-def check_methods(methods: Sequence[str], model: Model) -> None:
-    """Only methods on embeddings believe in something that can be shown."""
-    viewable = [name for name in model.methods if name not in (*RAW_FRAMES, *ANCHORS)]
-    for name in methods:
+def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) -> Subject:
+    """Open a model whose methods believe in something that can be shown: those on embeddings.
+
+    Raises:
+        MissingInputError: no model of the plant.
+        UsageError: a method sends something else, or the model does not hold it.
+    """
+    subject = open_subject(settings, screen, checkpoint, None)
+    if subject.model is None:
+        train = f"hjepa reproduce --preset {settings.preset}"
+        raise MissingInputError(f"no model of plant {settings.plant}", hint=train)
+    viewable = [name for name in subject.model.methods if name not in (*RAW_FRAMES, *ANCHORS)]
+    for name in settings.methods:
         if name not in viewable:
             raise UsageError(
                 f"method '{name}' cannot be viewed with this model; "
                 f"choose from {', '.join(viewable)}"
             )
+    return subject
 
 
 def make_link(
