@@ -160,7 +160,9 @@ def test_one_training_is_no_comparison(shell):
 
 
 def test_nothing_to_compare(shell):
-    assert_one_line_error(shell("compare"), 66, "no finished run")
+    missing = shell("compare")
+    assert_one_line_error(missing, 66, "no finished run")
+    assert "scale" not in missing.err
     assert_one_line_error(shell("compare", "--methods", "magic"), 2, "unknown method 'magic'")
 
 

@@ -116,11 +116,11 @@ def run(
 def evaluations(paths: Sequence[Path]) -> list[Path]:
     """The finished runs of ``eval`` among and below ``paths``. Raises MissingInputError."""
     places = list(paths) or [runs.ROOT / "eval"]
-    found = [directory for directory in found_runs(places) if stage_of(directory) == "eval"]
+    made_by = "hjepa eval"
+    found = [one for one in found_runs(places, made_by) if stage_of(one) == "eval"]
     if not found:
-        raise MissingInputError(
-            f"no finished run of eval in {', '.join(map(str, places))}", hint="hjepa eval"
-        )
+        where = ", ".join(map(str, places))
+        raise MissingInputError(f"no finished run of eval in {where}", hint=made_by)
     return found
 
 

@@ -67,8 +67,12 @@ def run(
     return {"report": out, "runs": directories, "figures": written}
 
 
-def found_runs(paths: Sequence[Path]) -> list[Path]:
+def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") -> list[Path]:
     """The finished runs among and below ``paths``, in the order of the pipeline.
+
+    Args:
+        paths: of runs or of directories that hold some; none: the newest run of each stage.
+        made_by: the commands to suggest where there is none.
 
     Raises:
         MissingInputError: none there.
@@ -81,7 +85,7 @@ def found_runs(paths: Sequence[Path]) -> list[Path]:
                 raise MissingInputError(
                     f"{path} is an unfinished run", hint=f"hjepa resume {shlex.quote(str(path))}"
                 )
-            raise MissingInputError(f"no finished run in {path}", hint="hjepa eval, hjepa scale")
+            raise MissingInputError(f"no finished run in {path}", hint=made_by)
         found += below
     if not paths:
         newest = [runs.newest_run(stage) for stage in STAGES]
