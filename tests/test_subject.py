@@ -172,7 +172,7 @@ def test_scale_drives_raw_frames_as_late_as_they_are(
         return
     result = scale.run(options, Output().screen)
     expected = (
-        [("supervised-2", 3), ("supervised-2", 2)] if law == "duty" else [("supervised-2", 0)]
+        [("supervised-2+3", 3), ("supervised-2+2", 2)] if law == "duty" else [("supervised-2", 0)]
     )
     assert [item for item in driven if item[0] != "local"] == expected
     rows = {(row["method"], row["snr_db"]): row for row in result["rows"]}
