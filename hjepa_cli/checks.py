@@ -86,7 +86,10 @@ POSITIVE = (
     *("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket"),
     *("conditions.light", "conditions.pole_length"),
 )
-BELOW_ONE = ("actor.dropout", "encoder.ema_decay", "protocol.plant_spread", "protocol.bracket")
+BELOW_ONE = (
+    *("actor.dropout", "encoder.ema_decay", "encoder.light_spread"),
+    *("protocol.plant_spread", "protocol.bracket"),
+)
 
 
 def check_settings(settings: Settings) -> None:

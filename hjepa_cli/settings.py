@@ -81,6 +81,8 @@ class EncoderSettings:
     regulariser_weight: float
     mirror: Literal["exact", "augment", "none"]
     shift_px: int
+    light_spread: float
+    camera_noise: float
     precision: Literal["auto", "bf16", "fp32"]
     gate: bool
     gate_r2: tuple[float, ...]  # one per state; none: a cart-pole's four

@@ -5,13 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from hjepa_cli.core.conditions import Disturbed, actual_camera, actual_plant
+from hjepa_cli.core.conditions import Disturbed, actual_camera, actual_plant, vary
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Block, Simulator
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.errors import UsageError
+from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.stages.inputs import render
 from hjepa_cli.storage.curves import Digest
 from hjepa_cli.storage.zoo import zoo_directory
 
@@ -110,3 +112,42 @@ def test_rollouts_to_predict_are_of_the_devices_and_training_is_nominal() -> Non
     devices.states = now
     devices.step(plant("desktop").teacher()(now))  # which does not know of the longer poles
     np.testing.assert_allclose(devices.states, other.states[:, 2], atol=1e-5)
+
+
+def test_every_training_trajectory_has_a_light_and_a_noise_of_its_own() -> None:
+    frames = np.full((300, 2, 16, 16, 3), 100, dtype=np.uint8)
+
+    def varied(split: str = "train", seed: int = 0, **spreads: float) -> np.ndarray:
+        changes = {f"encoder.{name}": value for name, value in spreads.items()}
+        options = load_settings(flags={"seed": seed, **changes})
+        return vary(frames, options, split)
+
+    assert varied() is frames
+    lights = varied(light_spread=0.3).astype(float) / 100
+    assert (lights == lights[:, :1, :1, :1, :1]).all()  # one light for a trajectory
+    light = lights[:, 0, 0, 0, 0]
+    # Uniform in 0.7 … 1.3: the standard deviation is 0.6 / √12.
+    assert light.min() >= 0.7 and light.max() <= 1.3
+    assert abs(light.mean() - 1) < 4 * 0.6 / np.sqrt(12 * 300)
+    assert light.min() < 0.73 and light.max() > 1.27
+    noisy = varied(camera_noise=8.0).astype(float)
+    widths = noisy.std(axis=(1, 2, 3, 4))
+    assert widths.max() < 9 and widths.max() > 7 and widths.min() < 1
+    assert abs(widths.mean() - 4) < 4 * 8 / np.sqrt(12 * 300) + 0.05  # rounding adds a little
+    assert (noisy[:, 0] != noisy[:, 1]).any(), "noise is drawn anew for every picture"
+    again = varied(light_spread=0.3, camera_noise=8.0)
+    np.testing.assert_array_equal(again, varied(light_spread=0.3, camera_noise=8.0))
+    for other in ({"split": "test"}, {"seed": 1}):
+        assert (again != varied(light_spread=0.3, camera_noise=8.0, **other)).any()
+    np.testing.assert_array_equal(frames, 100)
+
+
+def test_both_training_stages_see_the_same_varied_pictures() -> None:
+    options = load_settings(flags={"encoder.light_spread": 0.3, "encoder.camera_noise": 4.0})
+    recorded = generate(settings(), "train", range(3))
+    for split in ("train", "test"):
+        pictures = plant("desktop").camera().render(recorded.states.reshape(-1, 4))
+        whole = pictures.reshape(*recorded.states.shape[:2], *pictures.shape[1:])
+        expected = vary(whole, options, split)
+        seen = render(recorded, options, Screen(quiet=True), split)
+        np.testing.assert_array_equal(seen.frames.numpy(), expected)

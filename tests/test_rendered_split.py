@@ -39,7 +39,7 @@ def recorded() -> Trajectories:
 
 @pytest.fixture(scope="module")
 def split(recorded: Trajectories) -> RenderedSplit:
-    return render(recorded, "desktop", QUIET)
+    return render(recorded, load_settings(), QUIET)
 
 
 def pictures(states: np.ndarray) -> Tensor:
@@ -82,7 +82,7 @@ def test_stored_frames_are_read_as_rendered_ones(
     stored = Trajectories(
         recorded.states, recorded.applied_n, recorded.teacher_n, pictures(recorded.states).numpy()
     )
-    assert torch.equal(render(stored, "desktop", QUIET).seen(1), split.seen(1))
+    assert torch.equal(render(stored, load_settings(), QUIET).seen(1), split.seen(1))
 
 
 @pytest.mark.parametrize("mirror", [False, True])
@@ -117,7 +117,7 @@ def test_shifted_windows_are_what_the_camera_sees_elsewhere_on_the_track(
 ) -> None:
     """Against the camera: the same states, so many pixels to the side."""
     in_view = recorded.states * np.array([0.2, 1, 0.5, 1], np.float32)
-    split = render(dataclasses.replace(recorded, states=in_view), "desktop", QUIET)
+    split = render(dataclasses.replace(recorded, states=in_view), load_settings(), QUIET)
     windows = FrameWindows(
         split.frames, split.actions, window_frames=3, stride=4, mirror=False, shift_px=2
     )
@@ -150,7 +150,7 @@ def test_labels_are_what_the_teacher_does_where_the_window_shows(
 ) -> None:
     """The state that a moved window shows is found through the camera, then the teacher asked."""
     in_view = recorded.states * np.array([0.2, 1, 0.5, 1], np.float32)
-    split = render(dataclasses.replace(recorded, states=in_view), "desktop", QUIET)
+    split = render(dataclasses.replace(recorded, states=in_view), load_settings(), QUIET)
     kind = plant("desktop")
     windows = FrameWindows(
         split.frames,
@@ -189,7 +189,7 @@ def test_labels_are_what_the_teacher_does_where_the_window_shows(
 def test_shifted_copies_are_embedded_and_labelled_where_they_are(recorded: Trajectories) -> None:
     """An encoder that keeps the present picture shows what was embedded."""
     in_view = recorded.states * np.array([0.2, 1, 0.5, 1], np.float32)
-    split = render(dataclasses.replace(recorded, states=in_view), "desktop", QUIET)
+    split = render(dataclasses.replace(recorded, states=in_view), load_settings(), QUIET)
     split = dataclasses.replace(
         split, labels=torch.from_numpy(plant("desktop").teacher()(in_view[:, 1:]) / LIMIT_N)
     )

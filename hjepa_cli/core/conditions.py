@@ -1,4 +1,5 @@
-"""How devices may differ from those that everything was trained on: poles, light, camera noise.
+"""How devices may differ from those that everything was trained on: poles, light, camera noise;
+and pictures for training in which light and noise vary.
 
 Controllers, teachers and the oracle's equations stay the nominal ones: nobody tells them.
 """
@@ -16,6 +17,8 @@ from hjepa_cli.core.system import Camera, Floats, System
 from hjepa_cli.settings import Settings
 
 _NOISE_KEY = 0xCA3E
+_VARIED_KEY = 0x11B7
+_SPLITS = ("train", "test")
 
 
 def actual_plant(settings: Settings) -> System:
@@ -56,13 +59,9 @@ class Disturbed:
 
     def render(self, states: ArrayLike) -> NDArray[np.uint8]:
         """States ``[n, S]`` → RGB frames ``[n, 64, 128, 3]``."""
-        values = self._light * self._camera.render(states).astype(np.float32)
-        if self._noise:
-            drawn = zlib.crc32(np.ascontiguousarray(states, np.float64).tobytes())
-            random = generator(self._seed, _NOISE_KEY, drawn)
-            values += self._noise * random.standard_normal(values.shape, np.float32)
-        seen: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
-        return seen
+        drawn = zlib.crc32(np.ascontiguousarray(states, np.float64).tobytes())
+        random = generator(self._seed, _NOISE_KEY, drawn)
+        return disturbed(self._camera.render(states), self._light, self._noise, random)
 
     def manifest(self) -> dict[str, Any]:
         """As of any camera."""
@@ -71,3 +70,34 @@ class Disturbed:
     def sketch_px(self, state: ArrayLike) -> list[Floats]:
         """As of any camera."""
         return self._camera.sketch_px(state)
+
+
+def disturbed(
+    frames: NDArray[np.uint8], light: float, noise: float, random: np.random.Generator
+) -> NDArray[np.uint8]:
+    """``frames`` of any shape with all values × ``light`` and white noise added, clipped.
+
+    ``noise`` is its standard deviation in steps of 8-bit values.
+    """
+    values = np.float32(light) * frames.astype(np.float32)
+    if noise:
+        values += np.float32(noise) * random.standard_normal(values.shape, np.float32)
+    seen: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return seen
+
+
+def vary(frames: NDArray[np.uint8], settings: Settings, split: str) -> NDArray[np.uint8]:
+    """Pictures [N, T, H, W, 3] of ``split``, each trajectory in a light and noise of its own.
+
+    The light is uniform in 1 ± ``encoder.light_spread``, the noise's standard deviation between 0
+    and ``encoder.camera_noise``. Without both, ``frames`` themselves come back.
+    """
+    spread, most = settings.encoder.light_spread, settings.encoder.camera_noise
+    if not (spread or most):
+        return frames
+    random = generator(settings.seed, _VARIED_KEY, _SPLITS.index(split))
+    varied = np.empty_like(frames)
+    for before, after in zip(frames, varied, strict=True):
+        light, noise = 1 + spread * random.uniform(-1, 1), most * random.uniform()
+        after[:] = disturbed(before, light, noise, random)
+    return varied

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hjepa_cli import __version__
 from hjepa_cli.core.batches import Labels, shift_sideways
+from hjepa_cli.core.conditions import vary
 from hjepa_cli.core.history import frames_seen
 from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import encode_frames
@@ -159,9 +160,11 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
     return load_dataset(path, settings.plant)
 
 
-def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> RenderedSplit:
-    """Frames of one split, rendered now unless the dataset stores them."""
-    kind = plant(plant_name)
+def render(
+    trajectories: Trajectories, settings: Settings, screen: Screen, split: str = "train"
+) -> RenderedSplit:
+    """Frames of a split, rendered now unless the dataset stores them, in varied light and noise."""
+    kind = plant(settings.plant)
     limit_n, frames = kind.force_limit_n, trajectories.frames
     if frames is None:
         camera = kind.camera()
@@ -175,7 +178,7 @@ def render(trajectories: Trajectories, plant_name: str, screen: Screen) -> Rende
                 bar.advance(len(chunk))
         frames = np.concatenate(parts)
     return RenderedSplit(
-        frames=torch.from_numpy(frames),
+        frames=torch.from_numpy(vary(frames, settings, split)),
         states=torch.from_numpy(trajectories.states[:, 1:].copy()),
         actions=torch.from_numpy(trajectories.applied_n / limit_n),
         labels=torch.from_numpy(trajectories.teacher_n / limit_n),

@@ -76,7 +76,7 @@ def _run(
             return record.result
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path} ({settings.plant}), run {record.directory}")
-        train, test = (render(split, settings.plant, screen) for split in recorded.values())
+        train, test = (render(of, settings, screen, split) for split, of in recorded.items())
         architecture = describe_architecture(settings)
         kind = plant(settings.plant)
         modules = build_modules(architecture, kind.action_shape, kind.force_signs)

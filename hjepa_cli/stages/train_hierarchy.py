@@ -60,6 +60,7 @@ FLAT_SETTINGS = (  # all that the training of the flat baseline depends on
     *("optimizer", "schedule", "gradient_clip", "coarse_learning_rate", "coarse_weight_decay"),
     "shifted_copies",
 )
+PICTURE_SETTINGS = ("precision", "shift_px", "light_spread", "camera_noise")  # of [encoder]
 ARCHITECTURE = ("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual")
 
 
@@ -110,7 +111,7 @@ def run(
             screen.say("actor and ts-jepa-1 are the encoder checkpoint's: same data and settings")
         modules.to(resolve_device(settings.device))
 
-        train, test = (render(split, settings.plant, screen) for split in recorded.values())
+        train, test = (render(of, settings, screen, split) for split, of in recorded.items())
         exact = architecture["mirror"] == "exact"
         flip = architecture["mirror"] == "augment"
         seen = embed_all(modules["encoder"], train, settings, screen, flip=flip)
@@ -231,9 +232,7 @@ def trained_alike(source: Checkpoint, data: Dataset, settings: Settings) -> bool
     return (
         (metadata["dataset"], metadata["seed"]) == (data.digest, settings.seed)
         and theirs["actor"] == mine["actor"]
-        and all(
-            theirs["encoder"].get(key) == mine["encoder"][key] for key in ("precision", "shift_px")
-        )
+        and all(theirs["encoder"].get(key, 0) == mine["encoder"][key] for key in PICTURE_SETTINGS)
         and all(theirs["hierarchy"].get(key) == mine["hierarchy"][key] for key in FLAT_SETTINGS)
     )
 
