@@ -36,7 +36,7 @@ from hjepa_cli.core.metrics import student_interval
 from hjepa_cli.stages.compare import differences
 
 STUDIES = Path(__file__).parent / "studies"
-PROBES = ("x", "x_dot", "theta", "theta_dot")
+PROBES = {"x": "$x$", "x_dot": r"$\dot x$", "theta": r"$\theta$", "theta_dot": r"$\dot\theta$"}
 SECTIONS_OF = {  # a stage's results depend on these settings, and on the stages before
     "collect": ("collect",),
     "train-encoder": ("collect", "encoder", "actor"),
@@ -206,9 +206,9 @@ def size_figure(measured: dict[str, dict[int, dict[str, Any]]], axis: str) -> Fi
         left, right = figure.subfigures(1, 2)
         probes, errors = left.subplots(), right.subplots()
         rows = [list(by_seed.values()) for by_seed in measured.values()]
-        for probe, marker in zip(PROBES, "o^sD", strict=True):
+        for (probe, symbol), marker in zip(PROBES.items(), "o^sD", strict=True):
             r2 = [[result["health"]["probe_r2"][probe] for result in row] for row in rows]
-            line(probes, probe, marker, r2)
+            line(probes, symbol, marker, r2)
         entries = [[next(iter(result["methods"].values())) for result in row] for row in rows]
         for window, marker in zip(windows_of(measured), "o^sD", strict=False):
             line(
