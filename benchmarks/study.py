@@ -32,6 +32,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hjepa_cli import figures
+from hjepa_cli.core.loop import LOOP_VERSION
 from hjepa_cli.core.metrics import student_interval
 from hjepa_cli.stages.compare import differences
 
@@ -102,7 +103,8 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
 
     def evaluate(checkpoint: str | Path, methods: list[str], *of: Any) -> dict[str, Any]:
         named = ("--checkpoint", checkpoint, "--methods", ",".join(methods))
-        return dict(run("eval", *named, "--out", directory("eval", *of, methods))["methods"])
+        out = directory("eval", *of, methods, LOOP_VERSION)  # measured anew in another loop
+        return dict(run("eval", *named, "--out", out)["methods"])
 
     if "checkpoint" in row:
         return {"health": {}, "methods": evaluate(row["checkpoint"], methods, row["checkpoint"])}

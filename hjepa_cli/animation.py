@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX
-from hjepa_cli.core.system import System
+from hjepa_cli.core.system import Camera, System
 from hjepa_cli.errors import MissingInputError, StorageError, UsageError
 from hjepa_cli.pictures import FAINT, INK, PAPER, font
 from hjepa_cli.storage import files
@@ -44,14 +44,17 @@ class Pictures:
         films: one per method, of the same devices and steps.
         link: what the radio did to them.
         kind: the plant.
+        camera: what looks at it.
         every: control steps between pictures.
     """
 
-    def __init__(self, films: "Sequence[Film]", link: "Link", kind: System, every: int) -> None:
+    def __init__(
+        self, films: "Sequence[Film]", link: "Link", kind: System, camera: Camera, every: int
+    ) -> None:
         self.films, self.link, self.kind = films, link, kind
         self.every = every
         self.steps = list(range(0, len(link.delivered), every))
-        self._camera = kind.camera()
+        self._camera = camera
         self.devices = link.delivered.shape[1]
         width = max(self.devices * (PANEL_PX[0] + MARGIN_PX) + MARGIN_PX, LEAST_WIDTH_PX)
         height = len(films) * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX

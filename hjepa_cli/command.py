@@ -27,15 +27,10 @@ class PipeClosed(HjepaError):
 
 
 def resolve(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -> Settings:
-    """Merge preset, file and flags; refuse values that make no sense before anything is touched.
-
-    A plant has its own ranges and noise, so ``--plant gym`` alone means its preset.
-    """
+    """Merge preset, file and flags; refuse values that make no sense before anything is touched."""
     plant = flags["plant"]
-    if preset is None and plant in PRESETS:
-        preset = plant
     settings = load_settings(preset, config, flags)
-    if plant is not None and (own := load_settings(preset).plant) != plant:
+    if plant is not None and (own := load_settings(settings.preset).plant) != plant:
         named = plant if plant in PRESETS else "default"
         raise UsageError(
             f"preset '{settings.preset}' holds the ranges and noise of plant '{own}', "

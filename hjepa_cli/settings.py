@@ -249,8 +249,10 @@ def load_settings(
 ) -> Settings:
     """Merge default < preset < config file < flags.
 
+    A plant has its own ranges and noise, so ``plant`` in flags or file alone means its preset.
+
     Args:
-        preset: one of :data:`PRESETS`; ``None`` is ``"default"``.
+        preset: one of :data:`PRESETS`; ``None`` is that of the plant, else ``"default"``.
         config: a TOML file of the same shape as the presets.
         flags: dotted key (``"collect.steps"``) to value; ``None`` values were not given.
 
@@ -259,7 +261,7 @@ def load_settings(
         MissingInputError: the config file is not there.
         DataError: the config file is not TOML.
     """
-    name = preset or "default"
+    name = preset or _preset_of_plant(config, flags or {})
     values: dict[str, Any] = {}
     for source, changes in _layers(name, config, flags or {}):
         if values:
@@ -285,7 +287,8 @@ def origins(
     Raises:
         As :func:`load_settings`.
     """
-    layers = _layers(preset or "default", config, flags or {})
+    flags = flags or {}
+    layers = _layers(preset or _preset_of_plant(config, flags), config, flags)
     return {key: source for source, changes in layers for key in dotted(changes)}
 
 
@@ -299,6 +302,11 @@ def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
         else:
             flat[key] = value
     return flat
+
+
+def _preset_of_plant(config: Path | None, flags: Mapping[str, Any]) -> str:
+    plant = flags.get("plant") or (_read_config(config).get("plant") if config else None)
+    return plant if plant in PRESETS else "default"
 
 
 def _layers(

@@ -44,6 +44,15 @@ def test_duty_row_by_hand():
     assert found["reason"] is None and found["at_least"] is False
 
 
+def test_bits_of_packets_that_take_several_slots_are_those_of_the_period_that_was_counted():
+    found = row("duty", entry(gap=100.0), bandwidth_hz=1e4)
+    late = 2064 / (1e4 * 1e-3 * math.log2(101))  # 31 slots
+    assert found["devices"] == math.floor((100 - late) / late)
+    assert found["bits_per_s"] == pytest.approx(2064 / ((100 - late) * 1e-3))
+    never = row("duty", entry(gap=20.0), bandwidth_hz=1e4)
+    assert never["devices"] == 0 and never["bits_per_s"] is never["ratio_to_limit"] is None
+
+
 def test_equal_row_by_hand():
     found = row("equal", entry(p=0.02))
 

@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
+from hjepa_cli.api import drive, load_model
 from hjepa_cli.core.conditions import Disturbed, actual_camera, actual_plant, vary
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
@@ -13,8 +15,11 @@ from hjepa_cli.core.trajectories import generate
 from hjepa_cli.errors import UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.stages import collect
 from hjepa_cli.stages.inputs import render
+from hjepa_cli.stages.view import film, make_link
 from hjepa_cli.storage.curves import Digest
+from hjepa_cli.storage.datasets import load_dataset
 from hjepa_cli.storage.zoo import zoo_directory
 
 STATES = np.array([[0.01, 0.2, 0.1, -0.3], [-0.02, 0.0, -0.2, 1.0]])
@@ -151,3 +156,30 @@ def test_both_training_stages_see_the_same_varied_pictures() -> None:
         expected = vary(whole, options, split)
         seen = render(recorded, options, Screen(quiet=True), split)
         np.testing.assert_array_equal(seen.frames.numpy(), expected)
+
+
+def test_curves_know_of_which_devices_a_dataset_s_clean_rollouts_are(tmp_path) -> None:
+    """A dataset of longer poles answers for a nominal evaluation under a digest of its own."""
+
+    def digest(options: Settings, dataset: str | None) -> str:
+        recorded = load_dataset(tmp_path / dataset).settings if dataset else None
+        return Digest.of(None, options, recorded).protocol
+
+    smoke, longer = settings("smoke"), settings("smoke", pole_length=1.5)
+    for name, options in (("nominal", smoke), ("longer", longer)):
+        collect.run(options, Screen(quiet=True), out=tmp_path / name)
+    assert digest(smoke, "nominal") == digest(smoke, None)
+    assert digest(longer, "longer") == digest(longer, None)
+    assert len({digest(one, of) for one in (smoke, longer) for of in ("nominal", "longer")}) == 4
+
+
+def test_a_film_is_of_the_devices_that_are_driven() -> None:
+    changes = {"conditions.pole_length": 1.5, "protocol.steps": 40}
+    options, model = load_settings(flags=changes), load_model("desktop-h4m2l1")
+    link = make_link(options, model, 2, 20.0, 0.05, 4.0)
+    probe = torch.zeros(257, 4, dtype=torch.float64)
+    shot = film("hold", options, model, link, probe, Screen(quiet=True))
+    driven = drive("hold", model=model, gap_steps=4.0, devices=2, settings=changes)
+    np.testing.assert_array_equal(shot.states, driven["states"])
+    nominal = drive("hold", model=model, gap_steps=4.0, devices=2, settings={"protocol.steps": 40})
+    assert abs(nominal["states"] - shot.states).max() > 0.01

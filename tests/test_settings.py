@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.settings import PRESETS, Settings, load_settings
+from hjepa_cli.settings import PRESETS, Settings, load_settings, origins
 
 
 def preset_file(name: str) -> dict[str, Any]:
@@ -166,3 +166,16 @@ def test_every_setting_is_read_somewhere() -> None:
     names = {field.name for kind in kinds for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     dead = sorted(name for name in names if not is_read(name))
     assert not dead, f"settings that nobody reads: {dead}"
+
+
+def test_a_plant_alone_means_its_preset(tmp_path) -> None:
+    """In a file as on the command line: the other plant's ranges and noise fit no better there."""
+    (tmp_path / "gym.toml").write_text('plant = "gym"\n[protocol]\ncurve_devices = 7\n')
+    expected = load_settings("gym", flags={"protocol.curve_devices": 7})
+    assert load_settings(config=tmp_path / "gym.toml") == expected
+    assert load_settings(flags={"plant": "gym"}) == load_settings("gym")
+    assert origins(config=tmp_path / "gym.toml")["protocol.steps"] == "preset gym"
+    named = load_settings("default", tmp_path / "gym.toml")  # whoever names another wants it
+    assert named.protocol.steps == load_settings("default").protocol.steps
+    flag = load_settings(config=tmp_path / "gym.toml", flags={"plant": "desktop"})
+    assert (flag.preset, flag.plant) == ("default", "desktop")

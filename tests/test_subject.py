@@ -226,7 +226,7 @@ def test_anchors_are_measured_like_any_method(checkpoint: Path, quick_encoder: N
         ("ts-jepa-3", {}, "hjepa train-hierarchy --h 3"),
         ("ts-jepa-1", {}, "hjepa train-hierarchy"),
         ("linear", {}, "hjepa train-hierarchy"),
-        ("ts-jepa-2", {"plant": "gym"}, "hjepa train-hierarchy --plant gym --h 2"),
+        ("ts-jepa-2", {"plant": "gym"}, "hjepa train-hierarchy --preset gym --h 2"),
     ],
 )
 def test_the_command_that_trains_a_method(method: str, flags: dict[str, Any], command: str) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,14 @@ import pytest
 import torch
 
 from hjepa_cli.checks import ANCHORS
+from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.model import Model, load_modules
 from hjepa_cli.core.symmetry import reflect
 from hjepa_cli.errors import DataError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import collect, train_encoder, train_hierarchy
+from hjepa_cli.stages.train_hierarchy import open_encoder
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
 QUIET = Screen(quiet=True)
@@ -205,6 +208,17 @@ def test_any_checkpoint_brings_its_encoder_but_only_a_hierarchy_drives(workplace
         Model.load(workplace / "encoder" / "model.safetensors")
 
 
+def test_an_encoder_of_another_symmetry_is_not_taken(
+    workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(workplace)
+    named = Path("runs/train-encoder/0001")
+    train_encoder.run(settings(encoder__mirror="augment"), QUIET, dataset=workplace / "data")
+    assert open_encoder(None, settings(encoder__mirror="augment"), QUIET).path.parent == named
+    assert open_encoder(None, settings(encoder__mirror="none"), QUIET).path.parent != named
+    shutil.rmtree("runs")
+
+
 def test_other_strides_share_what_depends_on_none(workplace: Path) -> None:
     train(workplace, "whole")
     first = networks(workplace / "whole")
@@ -303,3 +317,15 @@ def test_a_stride_longer_than_the_trajectories_is_refused_before_any_work(workpl
     with pytest.raises(UsageError, match="100 steps; choose --h below 100"):
         train(workplace, "too-long", hierarchy__h=128)
     assert not (workplace / "too-long").exists()
+
+
+def test_true_states_are_charged_the_bits_of_the_model_s_embeddings(workplace: Path) -> None:
+    """So that device counts differ by control alone, whatever the settings would train."""
+    small = settings(encoder__embedding=64)
+    encoder, levels = workplace / "encoder-64", workplace / "levels-64"
+    train_encoder.run(small, QUIET, dataset=workplace / "data", out=encoder)
+    train_hierarchy.run(small, QUIET, dataset=workplace / "data", encoder=str(encoder), out=levels)
+    model = Model.load(levels / "model.safetensors", "cpu")
+    for method in ("hjepa", "hold-true", "oracle"):
+        assert build_method(method, settings(), model).bits_per_transmission == 64 * 8 + 16
+    assert build_method("oracle", settings(), None).bits_per_transmission == 256 * 8 + 16

@@ -142,7 +142,8 @@ def pictures(steps=300, devices=2, every=10):
     states[..., 2] = 0.1
     believed = states + np.array([0.0, 0, 0.2, 0])
     film = Film("hjepa", states, believed, np.ones((steps, devices), bool))
-    return animation.Pictures([film], link, plant("desktop"), every)
+    kind = plant("desktop")
+    return animation.Pictures([film], link, kind, kind.camera(), every)
 
 
 def test_age_counts_from_the_last_arrival():

@@ -35,7 +35,6 @@ class Need:
         interval: its 95 % interval, ordered so that device counts ascend.
         at_least: the score was still acceptable where the measured range ends; there may be more.
         payload_bits: b.
-        packets_per_slot: that reach the controller of a loop at its tolerance.
         delay_steps: how late its packets were when the tolerance was measured.
     """
 
@@ -44,7 +43,6 @@ class Need:
     interval: tuple[float, float] | None
     at_least: bool
     payload_bits: int | None
-    packets_per_slot: float | None
     delay_steps: int = 0
 
     @classmethod
@@ -60,7 +58,6 @@ class Need:
             interval=None if ordered is None else (ordered[0], ordered[1]),
             at_least=bool(entry[f"tolerance_{kind}_censored"]),
             payload_bits=entry["bits_per_transmission"],
-            packets_per_slot=(1 / tolerance if law == "duty" else tolerance) if tolerance else None,
             delay_steps=delay_steps,
         )
 
@@ -112,8 +109,8 @@ class Cell:
         row["devices_ci95"] = [self._devices(need, end, snr_db) for end in ends]
         link = (need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
         row["load_per_block"] = row["devices"] / float(slot_capacity(*link))
-        if need.packets_per_slot is not None:
-            row["bits_per_s"] = need.payload_bits * need.packets_per_slot / self.slot_s
+        if packets_per_slot := self._packets_per_slot(need, snr_db):
+            row["bits_per_s"] = need.payload_bits * packets_per_slot / self.slot_s
             if self.limit_bits_per_s > 0:
                 row["ratio_to_limit"] = row["bits_per_s"] / self.limit_bits_per_s
         if row["devices"] == 0:
@@ -126,10 +123,23 @@ class Cell:
         if self.law == "equal":
             return int(equal_devices(tolerance, *link, noise=self.noise))
         c = slot_capacity(*link)
+        return int(duty_devices(self._period_slots(need, tolerance, float(c)), c))
+
+    def _period_slots(self, need: Need, tolerance: float, c: float) -> float:
+        """Between two packets of a loop that lasts ``tolerance`` slots without one (``duty``)."""
         if need.delay_steps:  # the tolerance was measured with packets that late
-            return int(duty_devices(tolerance, c))
+            return tolerance
         # A packet that is late on arrival has used up that much of the gap it could have bridged.
-        return int(duty_devices(max(tolerance - float(late_slots(c)), 0.0), c))
+        return max(tolerance - float(late_slots(c)), 0.0)
+
+    def _packets_per_slot(self, need: Need, snr_db: float) -> float:
+        """That reach the controller of a loop at its tolerance; 0 where no rate is enough."""
+        assert need.tolerance is not None and need.payload_bits is not None
+        if self.law == "equal":
+            return need.tolerance
+        c = slot_capacity(need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
+        period = self._period_slots(need, need.tolerance, float(c))
+        return 1 / period if period else 0.0
 
     def _why_nobody(self, tolerance: float, payload_bits: int, snr_db: float) -> str:
         if tolerance == (0.0 if self.law == "duty" else 1.0):

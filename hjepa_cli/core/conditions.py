@@ -16,9 +16,16 @@ from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.system import Camera, Floats, System
 from hjepa_cli.settings import Settings
 
+NOMINAL = {"light": 1.0, "camera_noise": 0.0, "pole_length": 1.0}
 _NOISE_KEY = 0xCA3E
 _VARIED_KEY = 0x11B7
 _SPLITS = ("train", "test")
+
+
+def altered(settings: Settings) -> dict[str, float]:
+    """The conditions that are not nominal."""
+    conditions = settings.as_dict()["conditions"]
+    return {key: value for key, value in conditions.items() if value != NOMINAL[key]}
 
 
 def actual_plant(settings: Settings) -> System:

@@ -79,7 +79,8 @@ def build_method(name: str, settings: Settings, model: "Model | None") -> Method
 def _build_method(name: str, settings: Settings, model: "Model | None") -> Method:
     payload = settings.protocol.payload
     if name in TRUE_STATE:
-        sent = bits_of(payload, settings.encoder.embedding)
+        trained = model.architecture if model else settings.as_dict()["encoder"]
+        sent = bits_of(payload, trained["embedding"])
         return true_state_method(name, plant(settings.plant), sent)
     if model is None or name not in model.methods:
         raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")

@@ -19,6 +19,7 @@ import numpy as np
 
 from hjepa_cli.checks import check_settings
 from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.conditions import altered
 from hjepa_cli.core.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.core.payload import raw_frame_bits
 from hjepa_cli.core.plant import plant, plant_of
@@ -76,10 +77,12 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     check(settings)
     started = time.perf_counter()
     camera = plant_of(settings).camera()
-    definition = {
+    definition: dict[str, Any] = {
         "seed": settings.seed,
         "collect": settings.as_dict()["collect"] | {"plant": settings.plant},
     }
+    if conditions := altered(settings):  # clean rollouts are of such devices
+        definition["conditions"] = conditions
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
             remove_log(directory)  # a kill between the two has left it behind

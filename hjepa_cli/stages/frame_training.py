@@ -110,7 +110,8 @@ class Training:
         count = options.batch_trajectories
         share = ranks.share(count)
         part = (share.stop - share.start) / count  # 1 on a single process
-        epoch_steps = max(self.train.actions.numel() // (count * windows.window_frames), 1)
+        frames_n = self.train.states[..., 0].numel()
+        epoch_steps = max(frames_n // (count * windows.window_frames), 1)
         parts = objective.parts() | {"optimiser": optimiser}
         done = self.progress.reached(phase)
         with self.screen.progress(f"train {phase}", options.steps, "steps", done=done) as bar:

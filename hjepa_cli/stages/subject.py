@@ -194,8 +194,6 @@ def how_to_train(method: str, settings: Settings) -> str:
         train += f" --frames {frames}" if frames != "2" else ""
     if settings.preset != "default":
         train += f" --preset {settings.preset}"
-    elif settings.plant != "desktop":
-        train += f" --plant {settings.plant}"
     if method.startswith("ts-jepa-") and method != "ts-jepa-1":
         return f"{train} --h {method.removeprefix('ts-jepa-')}"
     if method in ANCHORS and len(plant(settings.plant).state_names) != 4:

@@ -61,7 +61,10 @@ FLAT_SETTINGS = (  # all that the training of the flat baseline depends on
     "shifted_copies",
 )
 PICTURE_SETTINGS = ("precision", "shift_px", "light_spread", "camera_noise")  # of [encoder]
-ARCHITECTURE = ("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual")
+ARCHITECTURE = (
+    *("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual"),
+    "mirror",
+)
 
 
 def run(

@@ -17,6 +17,7 @@ from hjepa_cli.core import health
 from hjepa_cli.core.capacity import equal_devices
 from hjepa_cli.core.channel import rayleigh_power_gains
 from hjepa_cli.core.codecs import bits_of
+from hjepa_cli.core.conditions import actual_camera, actual_plant
 from hjepa_cli.core.controllers import StrideController
 from hjepa_cli.core.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
@@ -156,8 +157,8 @@ def run(
     probe = fit_probe(settings, subject.model, screen)
     films = [film(name, settings, subject.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.steps // 100, 1)
-    kind = plant(settings.plant)
-    pictures = animation.Pictures(films, link, kind, every)
+    kind = actual_plant(settings)
+    pictures = animation.Pictures(films, link, kind, actual_camera(settings), every)
     result = {
         "checkpoint": subject.path,
         "methods": {
@@ -267,7 +268,7 @@ def film(
     name: str, settings: Settings, model: Model, link: Link, probe: torch.Tensor, screen: Screen
 ) -> Film:
     """Drive the devices with one method and keep every state and belief."""
-    kind = plant(settings.plant)
+    kind = actual_plant(settings)
     method = build_method(name, settings, model)
     steps, devices = link.delivered.shape
     believer = Believer(method.controller(devices), probe)

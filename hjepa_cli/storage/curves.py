@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.checks import ANCHORS
+from hjepa_cli.core.conditions import altered
 from hjepa_cli.core.loop import LOOP_VERSION
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.settings import Settings
@@ -26,8 +27,6 @@ SCHEMA = 1
 Entry = dict[str, Any]
 
 Check = Callable[[Any], bool]
-
-NOMINAL = {"light": 1.0, "camera_noise": 0.0, "pole_length": 1.0}
 
 LARGEST = 1e12  # beyond anything that is measured; keeps arithmetic in range
 CLEAN = (  # settings of ``collect`` that clean rollouts depend on
@@ -82,6 +81,9 @@ class Digest:
             collected = source["collect"]
             clean = [source["seed"], *(collected[key] for key in CLEAN)]
             clean += collected.get("start", [])
+            conditions = altered(settings)
+            if dataset is not None and (theirs := source.get("conditions", {})) != conditions:
+                clean.append(theirs)
         except (LookupError, TypeError, AttributeError):
             raise DataError(
                 "the dataset does not say how its clean rollouts were made",
@@ -94,11 +96,8 @@ class Digest:
             "embedding": values["encoder"]["embedding"],
             "clean": clean,
         }
-        changed = {
-            key: value for key, value in values["conditions"].items() if value != NOMINAL[key]
-        }
-        if changed:  # or digests would not be those of before there were conditions
-            measured["conditions"] = changed
+        if conditions:  # or digests would not be those of before there were conditions
+            measured["conditions"] = conditions
         fitted = [values["collect"][key] for key in FITTED]
         if values["protocol"]["payload"].startswith("pca"):  # components are fitted to them, too
             measured["fitted"] = fitted
