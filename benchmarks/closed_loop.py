@@ -11,7 +11,6 @@ import argparse
 import dataclasses
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,7 +22,6 @@ from hjepa_cli.core.model import Model, build_modules
 from hjepa_cli.core.plant import CartPoles, plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Simulator, run_points
-from hjepa_cli.errors import HjepaError
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages.train_encoder import describe_architecture
 from hjepa_cli.storage import runs, zoo
@@ -91,14 +89,10 @@ def loops(model: Model, settings: Settings, devices: int, steps: int) -> None:
 
 def open_model(name: str | None, settings: Settings) -> Model:
     """The model asked for, the newest run's, the zoo's, or an untrained one."""
-    path: Path | None = zoo.resolve_model(name) if name else None
-    if path is None:
-        try:
-            path = runs.newest_run("train-hierarchy")
-            path = zoo.resolve_model(path or zoo.list_models()[0])
-        except (HjepaError, IndexError):
-            return untrained(settings)
-    return Model.load(path, settings.device)
+    found = name or runs.newest_run("train-hierarchy") or zoo.find_model(settings.plant)
+    if found is None:
+        return untrained(settings)
+    return Model.load(zoo.resolve_model(found), settings.device)
 
 
 def untrained(settings: Settings) -> Model:

@@ -162,7 +162,7 @@ def simulate_cell(
 
     Args:
         method: as on the command line; those on embeddings need ``model``.
-        devices: N, that share
+        devices: N, how many compete.
         blocks: J resource blocks in every slot, each as long as a packet.
         scheduler: who gets them.
         model: of :func:`load_model`.

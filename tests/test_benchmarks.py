@@ -218,7 +218,7 @@ def test_a_study_of_sizes_is_drawn(tmp_path: Path) -> None:
     study.write(measured, tmp_path / "embedding", "Values of an embedding")
     assert (tmp_path / "embedding.png").stat().st_size > 10_000
     probes, errors = study.size_figure(measured, "Values of an embedding").axes
-    assert [line.get_label() for line in probes.lines] == list(study.PROBES)
+    assert [line.get_label() for line in probes.lines] == list(study.PROBES.values())
     assert all(list(line.get_xdata()) == [64, 256] for line in probes.lines + errors.lines)
     assert list(probes.lines[0].get_ydata()) == [0.97, 0.99]
     assert probes.get_xlabel() == "Values of an embedding"

@@ -9,7 +9,7 @@ import scipy.linalg
 from hjepa_cli.core import policy
 from hjepa_cli.core.dynamics import derivative, rk4_step
 from hjepa_cli.core.plant import PLANTS
-from hjepa_cli.core.policy import gains, linear_gain, state_dependent_form, teacher
+from hjepa_cli.core.policy import gains, state_dependent_form, teacher
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.errors import UsageError
 
@@ -26,6 +26,11 @@ def scipy_gain(kind, a, b):
         p = scipy.linalg.solve_discrete_are(a, b, q, r)
         return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)[0]
     return (np.linalg.inv(r) @ b.T @ scipy.linalg.solve_continuous_are(a, b, q, r))[0]
+
+
+def linear_gain(kind):
+    """Of the linear quadratic regulator at the origin [4]."""
+    return gains(kind, np.zeros(1), np.zeros(1)).reshape(4)
 
 
 def draws(scale, count=400, seed=0):

@@ -81,17 +81,6 @@ def test_index_by_its_definition():
     assert growth.at([1, 60, 61, 500]) == pytest.approx([f[0], f[59], f[59], f[59]])
 
 
-@pytest.mark.parametrize("success", [0.3, 0.7, 1.0])
-def test_index_without_csi(success):
-    # f = A has a closed form: p A/2 (A + 2/p − 1).
-    growth = Growth(np.arange(1.0, 3001.0))
-    for age in (1, 2, 10, 50):
-        expected = success * age / 2 * (age + 2 / success - 1)
-        assert growth.index_without_csi(age, success) == pytest.approx(expected, rel=1e-9)
-    sure = geometric(1.03)
-    assert sure.index_without_csi(9, 1.0) == pytest.approx(float(sure.index(9)))
-
-
 @pytest.mark.parametrize("age", [1, 3, 12])
 def test_at_the_index_as_price_sending_now_or_a_slot_later_cost_the_same(age):
     f, price = geometric(1.1).table, float(geometric(1.1).index(age))

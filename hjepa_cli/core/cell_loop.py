@@ -7,7 +7,7 @@ Memory does not grow with the number of slots.
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hjepa_cli.core.disagreement import Levels, calibrate_levels
 from hjepa_cli.core.growth import Growth, conformal_growth
 from hjepa_cli.core.loop import (
-    Controller,
     World,
     device_draws,
     noise_per_step,
@@ -28,14 +27,6 @@ from hjepa_cli.settings import ProtocolSettings
 
 CHUNK_STEPS = 256
 CALIBRATION_DEVICES = 39  # (39 + 1) · 0.9 is whole: the conformal quantile is exact
-
-
-class ForesightedController(Controller, Protocol):
-    """A controller that can say what it will play if nothing arrives."""
-
-    def outlook(self) -> Floats:
-        """Forces of the coming step [n, *A]."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)

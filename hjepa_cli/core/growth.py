@@ -43,24 +43,6 @@ class Growth:
         spent = np.cumsum(self.table)[place]
         return np.asarray((place + 1) * self.table[self._place(age + 1)] - spent)
 
-    def index_without_csi(self, age: int, success: float, terms: int = 100_000) -> float:
-        """Whittle's index where an attempt succeeds with probability p, unknown beforehand.
-
-        p [(p (A − 1) + 1) S(A + 1) − Σ_{j<A} f(j) − S(A)], S(h) = Σ_k (1 − p)^k f(h + k); p = 1 is
-        :meth:`index`. From a renewal argument over the time between deliveries.
-        """
-        if not 0 < success <= 1:
-            raise UsageError(f"success probability {success}; it lies above 0 and at most at 1")
-        decay = (1.0 - success) ** np.arange(terms)
-        last = int(np.argmax(decay < 1e-18)) or terms
-
-        def ahead(start: int) -> float:
-            return float(decay[:last] @ self.at(start + np.arange(last)))
-
-        past = float(self.at(np.arange(1, age)).sum()) if age > 1 else 0.0
-        gain = (success * (age - 1) + 1.0) * ahead(age + 1) - past - ahead(age)
-        return success * gain
-
     def _place(self, age: ArrayLike) -> NDArray[np.int64]:
         return np.minimum(np.asarray(age, np.int64), len(self.table)) - 1
 

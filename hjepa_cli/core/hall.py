@@ -24,7 +24,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 SHADOWING_CORRELATION_M = 10.0  # TR 38.901 Table 7.5-6, InF, in sight and not
 K_FACTOR_DB = (7.0, 8.0)  # mean and standard deviation; TR 38.901 Table 7.5-6, InF in sight
-CLOSEST_M = 1.0  # the path-loss model starts here; nearer devices are dropped again
+CLOSEST_M = 1.0  # the path-loss model starts here; nearer devices are pushed out to it
 _HALL_KEY = 0x4A11
 
 

@@ -38,11 +38,6 @@ def teacher(preset: System | str) -> Teacher:
     return (plants.plant(preset) if isinstance(preset, str) else preset).teacher()
 
 
-def linear_gain(plant: Plant) -> Floats:
-    """Return the LQR gain ``[4]`` at the origin, for u = −K x."""
-    return gains(plant, np.zeros(1), np.zeros(1)).reshape(4)
-
-
 def gains(plant: Plant, theta: Floats, theta_dot: Floats) -> Floats:
     """Solve the Riccati equation at every state.
 

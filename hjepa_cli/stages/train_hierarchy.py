@@ -89,7 +89,6 @@ def run(
     recorded = {split: data.split(split) for split in ("train", "test")}
     check_stride(strides.h, recorded["train"].steps)
     source = open_encoder(encoder, settings, screen)
-    trained = load_modules(source)
     inputs = {
         "dataset": describe_input(data.path, data.digest),
         "encoder": describe_input(source.path, source.digest),
@@ -98,36 +97,21 @@ def run(
         if record.result is not None:
             show(record.result, screen)
             return record.result
+        trained = load_modules(source)
         torch.manual_seed(settings.seed)
         screen.say(f"dataset {data.path}, encoder {source.path}, run {record.directory}")
-        architecture, kind = describe_architecture(source, settings), plant(settings.plant)
-        modules = build_modules(architecture, kind.action_shape, kind.force_signs)
-        modules["encoder"].load_state_dict(trained["encoder"].state_dict())
-        modules["encoder"].requires_grad_(False).eval()
-        begun = source.metadata["architecture"]  # an encoder comes with a P^H, begun beside it
-        if "high" in modules and (begun["kind"], begun["h"]) == ("encoder", strides.h):
-            modules["high"].load_state_dict(trained["high"].state_dict())
-        shared = [name for name in SHARED if trained_alike(source, data, settings)]
-        for name in shared:
-            modules[name].load_state_dict(trained[name].state_dict())
+        architecture = describe_architecture(source, settings)
+        shared = SHARED if trained_alike(source, data, settings) else ()
         if shared:
             screen.say("actor and ts-jepa-1 are the encoder checkpoint's: same data and settings")
-        modules.to(resolve_device(settings.device))
+        modules = begin(architecture, source, trained, settings, shared)
 
         train, test = (render(of, settings, screen, split) for split, of in recorded.items())
-        exact = architecture["mirror"] == "exact"
         flip = architecture["mirror"] == "augment"
         seen = embed_all(modules["encoder"], train, settings, screen, flip=flip)
         if progress.fresh and "actor" not in shared:  # otherwise it comes back with the levels
             screen.say("fitting the semantic actor")
-            actor = fit_actor(
-                torch.cat([data.z.flatten(0, 1) for data, _ in seen]),
-                torch.cat([labels.flatten(0, 1) for _, labels in seen]),
-                settings.actor,
-                seed=settings.seed,
-                mirror=kind.force_signs if exact else None,
-            )
-            modules["actor"].load_state_dict(actor.state_dict())
+            fit_actor_to(modules, seen, settings, exact=architecture["mirror"] == "exact")
         embedded = [data for data, _ in seen]
         train_levels(modules, embedded, strides, settings, record, progress, screen, shared)
 
@@ -160,6 +144,44 @@ def run(
         show(result, screen)
         screen.say(f"model {path} in {result['seconds']:.0f} s; next: hjepa eval")
         return result
+
+
+def begin(
+    architecture: dict[str, Any],
+    source: Checkpoint,
+    trained: nn.ModuleDict,
+    settings: Settings,
+    shared: Sequence[str],
+) -> nn.ModuleDict:
+    """New networks, but for the frozen encoder, what is ``shared`` and the start of P^H."""
+    kind = plant(settings.plant)
+    modules = build_modules(architecture, kind.action_shape, kind.force_signs)
+    modules["encoder"].requires_grad_(False).eval()
+    taken = ["encoder", *shared]
+    begun = source.metadata["architecture"]  # an encoder comes with a P^H, begun beside it
+    if "high" in modules and (begun["kind"], begun["h"]) == ("encoder", architecture["h"]):
+        taken.append("high")
+    for name in taken:
+        modules[name].load_state_dict(trained[name].state_dict())
+    return modules.to(resolve_device(settings.device))
+
+
+def fit_actor_to(
+    modules: nn.ModuleDict,
+    seen: list[tuple[EmbeddedTrajectories, Tensor]],
+    settings: Settings,
+    *,
+    exact: bool,
+) -> None:
+    """Fit the semantic actor to all views of the training pictures; ``exact``: it mirrors."""
+    actor = fit_actor(
+        torch.cat([data.z.flatten(0, 1) for data, _ in seen]),
+        torch.cat([labels.flatten(0, 1) for _, labels in seen]),
+        settings.actor,
+        seed=settings.seed,
+        mirror=plant(settings.plant).force_signs if exact else None,
+    )
+    modules["actor"].load_state_dict(actor.state_dict())
 
 
 def show(result: dict[str, Any], screen: Screen) -> None:
