@@ -345,7 +345,9 @@ def evaluate(
     execute(
         screen,
         stage,
-        lambda: plan.plan_eval(settings, checkpoint, dataset, out, remeasure=remeasure),
+        lambda: plan.plan_eval(
+            settings, checkpoint, dataset, out, remeasure=remeasure, figure=figure
+        ),
         dry_run=dry_run,
         workers=workers,
         cluster=cluster,

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hjepa_cli.checks import LINKLESS, TRUE_STATE
+from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.errors import HjepaError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
@@ -172,9 +172,13 @@ def plan_eval(
     out: Path | None,
     *,
     remeasure: bool,
+    figure: bool = False,
 ) -> Plan:
     """Plan of ``hjepa eval``."""
-    subject = _subject(settings, checkpoint, dataset)
+    from hjepa_cli.stages.evaluate import open_measurable
+
+    quiet = Screen(quiet=True)
+    subject = open_measurable(settings, quiet, checkpoint, dataset, figure=figure)
     methods = subject.measurable(settings.methods)
     missing = _uncached(subject, methods, remeasure=remeasure)
     return Plan(
@@ -198,10 +202,13 @@ def plan_scale(
     verify: bool,
 ) -> Plan:
     """Plan of ``hjepa scale``."""
+    from hjepa_cli.stages.subject import open_subject
+
     radio = settings.radio
-    subject = _subject(settings, checkpoint, dataset)
     if radio.law == "scheduled":
-        return _plan_scheduled(settings, subject, out, snr_db)
+        return _plan_scheduled(settings, checkpoint, out, snr_db, verify=verify)
+    subject = open_subject(settings, Screen(quiet=True), checkpoint, dataset)
+    subject.check_any(settings.methods)
     methods = _timed(subject, snr_db)
     missing = _uncached(subject, methods, remeasure=remeasure)
     work = [
@@ -277,25 +284,37 @@ def plan_view(
 
 
 def _plan_scheduled(
-    settings: Settings, subject: "Subject", out: Path | None, snr_db: list[float]
+    settings: Settings,
+    checkpoint: str | None,
+    out: Path | None,
+    snr_db: list[float],
+    *,
+    verify: bool,
 ) -> Plan:
     """Plan of ``hjepa scale --law scheduled``: every load is simulated, none is cached."""
+    from hjepa_cli.stages.scheduled import open_schedulable
+
     radio = settings.radio
-    methods = [name for name in subject.measurable(settings.methods) if name not in LINKLESS]
+    subject, methods = open_schedulable(settings, Screen(quiet=True), checkpoint)
     searches = len(radio.schedulers) * radio.seeds
     if radio.load_depends_on_snr:
         searches *= len(snr_db)
+    work = [
+        f"simulate up to {SEARCH_LOADS} loads of about {BLOCK_DEVICES} devices for "
+        f"{settings.protocol.steps} slots in each of {searches} searches for "
+        f"{len(methods)} methods under {', '.join(radio.schedulers)}"
+    ]
+    loads = searches * SEARCH_LOADS
+    if verify:
+        work.append("simulate each load again, a little lighter and a little heavier")
+        loads += 2 * searches
     return Plan(
         command="scale",
         reads=[f"model {subject.name}"],
-        work=[
-            f"simulate up to {SEARCH_LOADS} loads of about {BLOCK_DEVICES} devices for "
-            f"{settings.protocol.steps} slots in each of {searches} searches for "
-            f"{len(methods)} methods under {', '.join(radio.schedulers)}"
-        ],
+        work=work,
         writes=[f"run {_run('scale', out)} with the table (CSV) and the figure"],
         writes_bytes=300_000,
-        seconds=5 + _drive_seconds(settings, methods, searches * SEARCH_LOADS * BLOCK_DEVICES),
+        seconds=5 + _drive_seconds(settings, methods, loads * BLOCK_DEVICES),
     )
 
 
@@ -332,13 +351,6 @@ def _predictor(settings: Settings, actions: int) -> int:
     inputs = 2 * settings.encoder.embedding + actions + 1
     parameters = (inputs + 1 + settings.encoder.embedding) * settings.encoder.hidden
     return parameters // 2 if settings.encoder.mirror == "exact" else parameters
-
-
-def _subject(settings: Settings, checkpoint: str | None, dataset: Path | None) -> "Subject":
-    """What the stage would open, without a word."""
-    from hjepa_cli.stages.subject import open_subject
-
-    return open_subject(settings, Screen(quiet=True), checkpoint, dataset)
 
 
 def _timed(subject: "Subject", snr_db: list[float]) -> list[str]:

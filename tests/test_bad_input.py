@@ -124,6 +124,33 @@ def test_a_depth_that_nobody_trained_names_the_command_that_does(shell, command)
 
 
 @pytest.mark.parametrize(
+    ("code", "arguments"),
+    [
+        (66, "eval --methods ts-jepa-9"),
+        (66, "scale --methods ts-jepa-9"),
+        (2, "scale --law scheduled --methods supervised-2"),
+        (66, "scale --law scheduled --methods optimal"),
+    ],
+)
+def test_a_plan_refuses_the_methods_that_the_command_would(shell, code, arguments):
+    command, *flags = arguments.split()
+    refused(shell, code, command, *flags, "--quiet", says=[flags[-1]])
+    refused(shell, code, command, *flags, "--dry-run", says=[flags[-1]])
+
+
+def test_a_plan_of_a_figure_refuses_models_of_different_seeds(shell, monkeypatch):
+    from hjepa_cli.errors import DataError
+    from hjepa_cli.stages.subject import Subject
+
+    def refuse(subject):
+        raise DataError("a figure of models that were trained with different seeds")
+
+    monkeypatch.setattr(Subject, "check_one_training_seed", refuse)
+    refused(shell, 65, "eval", "--figure", "--dry-run", says=["different seeds"])
+    assert shell("eval", "--dry-run").code == 0
+
+
+@pytest.mark.parametrize(
     ("law", "flags", "meant"),
     [
         ("duty", ["--seeds", "3"], "scheduled"),

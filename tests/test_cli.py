@@ -366,6 +366,14 @@ def test_dry_run_still_refuses_what_the_command_would(shell):
     assert_one_line_error(shell("scale", "--dry-run", "--snr", "30:10"), 2)
 
 
+@pytest.mark.parametrize("law", ["duty", "equal", "scheduled"])
+def test_dry_run_tells_of_the_verification(shell, law):
+    flags = ("scale", "--law", law, "--methods", "oracle", "--dry-run", "--json")
+    plain, verified = (shell(*flags, *more).document["plan"] for more in ((), ("--verify",)))
+    (check,) = set(verified["work"]) - set(plain["work"])
+    assert check.startswith("simulate ") and verified["seconds"] > plain["seconds"]
+
+
 # --- errors
 
 EXPECTED = [

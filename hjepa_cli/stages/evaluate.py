@@ -67,15 +67,7 @@ def run(
             matplotlib for ``figure``.
         DataError: a damaged file, one of another plant, or a figure of models of different seeds.
     """
-    check_methods(settings.methods)
-    if figure and find_spec("matplotlib") is None:
-        raise MissingInputError(
-            "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
-        )
-    subject = open_subject(settings, screen, checkpoint, dataset, further, one_seed=figure)
-    subject.check_any(settings.methods)
-    if figure:
-        subject.check_one_training_seed()
+    subject = open_measurable(settings, screen, checkpoint, dataset, further, figure=figure)
     inputs = subject.inputs(remeasure=remeasure)
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
         result = record.result
@@ -87,6 +79,31 @@ def run(
         if figure:
             result["figures"] = draw(result, settings, record.directory, screen)
         return result
+
+
+def open_measurable(
+    settings: Settings,
+    screen: Screen,
+    checkpoint: str | None,
+    dataset: Path | None,
+    further: Sequence[Path] | None = None,
+    *,
+    figure: bool = False,
+) -> Subject:
+    """Open what is to be evaluated, and refuse what cannot be before anything is written.
+
+    Args and errors are those of :func:`run`.
+    """
+    check_methods(settings.methods)
+    if figure and find_spec("matplotlib") is None:
+        raise MissingInputError(
+            "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
+        )
+    subject = open_subject(settings, screen, checkpoint, dataset, further, one_seed=figure)
+    subject.check_any(settings.methods)
+    if figure:
+        subject.check_one_training_seed()
+    return subject
 
 
 def draw(result: dict[str, Any], settings: Settings, directory: Path, screen: Screen) -> list[Path]:
@@ -333,13 +350,17 @@ def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:
         rollouts = subject.dataset.split("clean")
     else:
         rollouts = generate(settings, "clean")
-    steps, horizon = rollouts.teacher_n.shape[1], settings.protocol.horizon
+    check_horizon(settings.protocol.horizon, rollouts.teacher_n.shape[1])
+    return rollouts.states.astype("float64"), rollouts.teacher_n.astype("float64")
+
+
+def check_horizon(horizon: int, steps: int) -> None:
+    """Raise UsageError where clean rollouts of so many steps end before the horizon."""
     if steps <= horizon:
         raise UsageError(
             f"protocol.horizon = {horizon} needs clean rollouts of {horizon + 1} steps; "
             f"they have {steps}"
         )
-    return rollouts.states.astype("float64"), rollouts.teacher_n.astype("float64")
 
 
 def _source(found: dict[str, tuple[Entry, Path]]) -> str:

@@ -18,7 +18,7 @@ from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.scale import PAPER_GAIN_PERCENT, PAPER_SNR_DB, draw, enforce, write_csv
 from hjepa_cli.stages.scheduled_cell import ScheduledCell
-from hjepa_cli.stages.subject import open_subject
+from hjepa_cli.stages.subject import Subject, open_subject
 from hjepa_cli.storage.runs import Run
 
 COLUMNS = (
@@ -49,18 +49,8 @@ def run(
         NumericalError: ``verify`` does not confirm a load.
     """
     grid_db = parse_snr(settings.radio.snr_db)
-    if raw := [name for name in settings.methods if name in RAW_FRAMES]:
-        raise UsageError(
-            f"law scheduled fits packets into slots; {', '.join(raw)} needs several slots for one",
-            hint="choose --law duty for it, or other --methods",
-        )
-    subject = open_subject(settings, screen, checkpoint, None, further)
-    skipped = subject.skipped(settings.methods)
+    subject, methods = open_schedulable(settings, screen, checkpoint, further)
     subject.say_skipped(settings.methods, screen)
-    methods = [name for name in subject.measurable(settings.methods) if name not in LINKLESS]
-    if not methods:
-        hint = next(iter(skipped.values()), "choose a method that has a link")
-        raise MissingInputError(f"nothing to schedule for {', '.join(settings.methods)}", hint=hint)
     level = settings.protocol.acceptable_score
     inputs = subject.inputs(verify=verify)
     with Run.create("scale", out, settings.as_dict(), inputs) as record:
@@ -98,7 +88,7 @@ def run(
             "rows": sorted(rows, key=lambda row: row["snr_db"]),
             "gains": gains(rows, PAPER_SNR_DB if PAPER_SNR_DB in grid_db else max(grid_db)),
             "paper_gain_percent": PAPER_GAIN_PERCENT,
-            "skipped": skipped,
+            "skipped": subject.skipped(settings.methods),
         }
         result["csv"] = write_csv(record.path("devices.csv"), result["rows"], COLUMNS)
         result["figures"] = draw(result, record.directory, screen)
@@ -115,6 +105,32 @@ def run(
         show(result, screen)
         enforce(result.get("verify", []), level)
         return result
+
+
+def open_schedulable(
+    settings: Settings,
+    screen: Screen,
+    checkpoint: str | None,
+    further: Sequence[Path] | None = None,
+) -> tuple[Subject, list[str]]:
+    """Open what is to be simulated; returns it and its methods that share a band.
+
+    Raises:
+        UsageError: a method whose packets do not fit into slots.
+        MissingInputError: no such checkpoint, or none with any of the methods.
+    """
+    if raw := [name for name in settings.methods if name in RAW_FRAMES]:
+        raise UsageError(
+            f"law scheduled fits packets into slots; {', '.join(raw)} needs several slots for one",
+            hint="choose --law duty for it, or other --methods",
+        )
+    subject = open_subject(settings, screen, checkpoint, None, further)
+    methods = [name for name in subject.measurable(settings.methods) if name not in LINKLESS]
+    if not methods:
+        skipped = subject.skipped(settings.methods)
+        hint = next(iter(skipped.values()), "choose a method that has a link")
+        raise MissingInputError(f"nothing to schedule for {', '.join(settings.methods)}", hint=hint)
+    return subject, methods
 
 
 def gains(rows: list[Row], snr_db: float) -> list[Row]:
