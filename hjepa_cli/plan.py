@@ -232,6 +232,9 @@ def plan_scale(
 
 def plan_reproduce(settings: Settings, out: Path | None) -> Plan:
     """Plan of ``hjepa reproduce``, whose curves are all measured."""
+    from hjepa_cli.stages.reproduce import check
+
+    check(settings)
     parts = reproduce_parts(settings)
     return Plan(
         command="reproduce",

@@ -106,6 +106,44 @@ def test_dry_run_plans_all_stages_and_writes_nothing(shell, preset):
     assert plan["seconds"] > single["seconds"]
 
 
+@pytest.mark.parametrize(
+    ("flags", "config", "says"),
+    [
+        (["--methods", "hjepa,ts-jepa-7"], "", ["ts-jepa-7", "train-hierarchy --h 7", "ts-jepa-4"]),
+        (["--methods", "hjepa,supervised-2"], "", ["supervised-2", "--method supervised"]),
+        (["--methods", "hjepa"], "[hierarchy]\nh = 1\nm = 1\nl = 1", ["hjepa", "ts-jepa-1"]),
+        ([], '[encoder]\nmethod = "supervised"', ["'supervised'", "'jepa'"]),
+        ([], "[collect]\nsteps = 4", ["4 steps"]),
+        (["--methods", "hjepa"], "[hierarchy]\nh = 100", ["--h 100"]),
+        ([], "[protocol]\nhorizon = 120", ["horizon = 120"]),
+        ([], '[radio]\nsnr_db = "30:10"', ["--snr"]),
+    ],
+)
+@pytest.mark.parametrize("how", [[], ["--dry-run"]], ids=str)
+def test_what_a_late_stage_would_refuse_is_refused_at_once(shell, calls, flags, config, says, how):
+    """Though the zoo has a model of supervised-2: only what is trained here is measured here."""
+    Path("c.toml").write_text(config)
+    with shell.untouched():
+        outcome = shell("reproduce", "--config", "c.toml", *flags, *how)
+    assert_one_line_error(outcome, 2, *says)
+    assert len(calls) == 1
+
+
+def test_the_methods_it_serves_are_those_of_the_models_it_trains():
+    """Also of one level, of a depth of one, and of plants of six states."""
+    from hjepa_cli.checks import TRUE_STATE
+    from hjepa_cli.settings import load_settings
+
+    def served(preset, h, m, l):
+        flags = {"hierarchy.h": h, "hierarchy.m": m, "hierarchy.l": l}
+        return set(reproduce.servable(load_settings(preset, flags=flags))) - set(TRUE_STATE)
+
+    always = {"ts-jepa-1", "hold", "zero", "linear", "state-kf", "local"}
+    assert served(None, 8, 2, 1) == always | {"hjepa", "ts-jepa-8", "state-48"}
+    assert served(None, 7, 7, 7) == always | {"ts-jepa-7", "state-48"}
+    assert served("quadrotor", 1, 1, 1) == always
+
+
 def test_the_stages_take_what_they_are_given():
     """The stand-ins accept anything; the real stages must accept the same."""
     import inspect

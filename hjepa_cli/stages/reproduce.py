@@ -10,6 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli import plan
+from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.core.capacity import parse_snr
+from hjepa_cli.core.model import offered
+from hjepa_cli.core.plant import plant
+from hjepa_cli.errors import UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages import (
@@ -20,6 +25,9 @@ from hjepa_cli.stages import (
     train_encoder,
     train_hierarchy,
 )
+from hjepa_cli.stages.evaluate import check_horizon
+from hjepa_cli.stages.inputs import check_stride
+from hjepa_cli.stages.subject import how_to_train
 from hjepa_cli.storage.checkpoints import MODEL_FILE
 from hjepa_cli.storage.runs import Run
 
@@ -30,8 +38,9 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
     """Run the whole pipeline; returns the document of ``--json``.
 
     Raises:
-        As the stages; what is finished stays.
+        As :func:`check` and the stages; what is finished stays.
     """
+    check(settings)
     with Run.create("reproduce", out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
@@ -51,6 +60,39 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
                 bar.advance(expected_s[name])
         made = report.run(screen, [folder], out=folder / "report.html", figures=folder / "figures")
         return record.finish({"folder": folder, **results, "report": made["report"]})
+
+
+def check(settings: Settings) -> None:
+    """Refuse at once what a late stage would refuse after the others have worked for it.
+
+    Raises:
+        UsageError: a baseline in place of the encoder, a method of which no model is trained here,
+            trajectories too short for the strides or the horizon, a bad SNR grid.
+    """
+    method, collected = settings.encoder.method, settings.collect
+    if method != "jepa":
+        raise UsageError(
+            f"encoder.method = {method!r}; reproduce trains a hierarchy, which needs 'jepa'",
+            hint=f"hjepa train-encoder --method {method}",
+        )
+    served = servable(settings)
+    if missing := [name for name in settings.methods if name not in served]:
+        raise UsageError(
+            f"no model of {', '.join(missing)} is trained here; "
+            f"choose --methods from {', '.join(served)}",
+            hint=f"leave it out, or train it on its own: {how_to_train(missing[0], settings)}",
+        )
+    check_stride(max(settings.encoder.h, settings.hierarchy.h), collected.steps)
+    check_horizon(settings.protocol.horizon, collected.clean_steps)
+    parse_snr(settings.radio.snr_db)
+
+
+def servable(settings: Settings) -> tuple[str, ...]:
+    """The methods that the hierarchy of these settings can drive, and those without a model."""
+    strides = settings.hierarchy
+    kind = "flat" if strides.h == strides.m == strides.l else "hierarchy"
+    states = len(plant(settings.plant).state_names)
+    return (*offered({"kind": kind, "h": strides.h}, states), *TRUE_STATE)
 
 
 def stages(settings: Settings, screen: Screen, folder: Path) -> dict[str, Callable[[], Result]]:
