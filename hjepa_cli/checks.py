@@ -79,7 +79,8 @@ MAX_HARQ_ROUNDS = 16
 LARGEST_SEED = 2**63 - 1
 LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
 LARGEST_STRIDE = 10_000
-# Counts that may be 0; all others start at 1.
+# Counts that may be 0, and those of at least two: nothing is learned without a next one.
+FROM_TWO = ("collect.steps", "encoder.batch_frames")
 ZERO_ALLOWED = ("seed", "encoder.shift_px", "hierarchy.shifted_copies", "radio.overhead_bits")
 NEGATIVE_ALLOWED = ("encoder.gate_", "radio.power_dbm")  # thresholds of R²; decibels
 POSITIVE = (
@@ -104,14 +105,13 @@ def check_settings(settings: Settings) -> None:
         raise UsageError(f"seed = {settings.seed}; expected at most {LARGEST_SEED}")
     check_strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
     _check_frames(settings.encoder)
+    _check_halves(settings.encoder)
     check_methods(settings.methods)
     gaps = settings.protocol.gaps
     if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
         raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on")
     parse_payload(settings.protocol.payload)
     _check_radio(settings.radio)
-    if settings.collect.steps < 2:
-        raise UsageError(f"collect.steps = {settings.collect.steps}; expected at least 2")
     if settings.radio.bandwidth_hz > LARGEST_BANDWIDTH_HZ:
         raise UsageError(
             f"radio.bandwidth_hz = {settings.radio.bandwidth_hz:g}; "
@@ -207,6 +207,14 @@ def _check_frames(encoder: EncoderSettings) -> None:
         raise UsageError(f"--frames {encoder.frames}: method {encoder.method} takes {choices}")
 
 
+def _check_halves(encoder: EncoderSettings) -> None:
+    if encoder.mirror == "exact" and encoder.embedding % 2:
+        raise UsageError(
+            f"encoder.embedding = {encoder.embedding}; expected an even number, for a half that a "
+            'mirror keeps and one that it negates, or mirror = "augment" or "none"'
+        )
+
+
 def _check_radio(radio: RadioSettings) -> None:
     if not radio.schedulers:
         raise UsageError(f"no scheduler given; choose from {', '.join(SCHEDULERS)}")
@@ -233,8 +241,9 @@ def _check_radio(radio: RadioSettings) -> None:
 
 
 def _check_number(key: str, value: float) -> None:
-    if isinstance(value, int) and key not in ZERO_ALLOWED and value < 1:
-        raise UsageError(f"{key} = {value}; expected at least 1")
+    least = 0 if key in ZERO_ALLOWED else 2 if key in FROM_TWO else 1
+    if isinstance(value, int) and value < least:
+        raise UsageError(f"{key} = {value}; expected at least {least}")
     if value <= 0 and key in POSITIVE:
         raise UsageError(f"{key} = {value}; expected more than 0")
     if value < 0 and not key.startswith(NEGATIVE_ALLOWED):

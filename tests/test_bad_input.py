@@ -296,6 +296,10 @@ def test_flag_without_its_value(shell):
         ("[collect]\nx_m = -0.1\n", 2, "collect.x_m"),
         ("seed = -1\n", 2, "seed"),
         ("[actor]\ndropout = 1.0\n", 2, "actor.dropout"),
+        ("[collect]\nsteps = 1\n", 2, "collect.steps = 1; expected at least 2"),
+        ("[encoder]\nbatch_frames = 1\n", 2, "encoder.batch_frames = 1; expected at least 2"),
+        ("[encoder]\nembedding = 7\n", 2, "encoder.embedding = 7; expected an even number"),
+        ("[encoder]\nembedding = 1\n", 2, "encoder.embedding = 1; expected an even number"),
         ("[protocol]\ngaps = [5, 1]\n", 2, "protocol.gaps"),
         ("[protocol]\ngaps = []\n", 2, "protocol.gaps"),
         ("[protocol]\ngaps = [0, 1]\n", 2, "protocol.gaps"),
@@ -309,6 +313,12 @@ def test_flag_without_its_value(shell):
 def test_config_files_meet_the_same_rules_as_flags(shell, text, code, says):
     Path("c.toml").write_text(text)
     refused(shell, code, "collect", "--config", "c.toml", says=[says])
+
+
+@pytest.mark.parametrize("mirror", ["augment", "none"])
+def test_embeddings_without_halves_may_be_odd(shell, mirror):
+    Path("c.toml").write_text(f'[encoder]\nembedding = 7\nmirror = "{mirror}"\n')
+    assert shell("collect", "--config", "c.toml", "--dry-run").code == 0
 
 
 def test_missing_config_file(shell):
