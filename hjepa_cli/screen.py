@@ -275,6 +275,27 @@ def span(
     return f"{text} ({low:.{decimals}f} – {high:.{decimals}f})"
 
 
+def tolerance(
+    entry: Mapping[str, Any], value_key: str, key: str, decimals: int, bound: str
+) -> str | None:
+    """Set a tolerance of ``eval --json``: ``112.5 (104.1 – 118.0)``.
+
+    ``bound`` stands before it where the measured range ended first.
+    """
+    censored, interval = entry[f"tolerance_{key}_censored"], entry[f"tolerance_{key}_ci95"]
+    return span(entry[f"tolerance_{value_key}"], interval, decimals, bound if censored else "")
+
+
+def percent(ratio: float | None) -> str:
+    """1.38 → ``+38.0 %``."""
+    return "unbounded" if ratio is None else f"{100 * (ratio - 1):+.1f} %"
+
+
+def in_order(named: Mapping[str, Any], first: Sequence[str]) -> dict[str, Any]:
+    """What is named ``first`` in that order, then the rest: files keep names sorted."""
+    return {name: named[name] for name in dict.fromkeys((*first, *named)) if name in named}
+
+
 def plain(value: Any) -> Any:
     """Turn a result into JSON values: arrays to lists, paths to strings, NaN and ±inf to None.
 

@@ -200,6 +200,12 @@ def test_the_commands_name_what_the_run_was_given(shell, without_figures):
     assert command in Path("report.html").read_text()
 
 
+def test_further_models_have_no_flag(shell):
+    """Each method's model is looked for again: `hjepa eval` takes one --checkpoint."""
+    given = {name: {"path": f"/{name}"} for name in ("checkpoint", "checkpoint 2", "checkpoint 3")}
+    assert report.inputs_of({"inputs": given}) == ["--checkpoint", "/checkpoint"]
+
+
 def test_a_smoke_run_is_called_one(shell, without_figures):
     trained()
     shell("report")

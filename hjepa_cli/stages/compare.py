@@ -19,7 +19,7 @@ from hjepa_cli.checks import METHODS, TRUE_STATE, check_methods
 from hjepa_cli.core.metrics import student_interval
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen, span
+from hjepa_cli.screen import Screen, span, tolerance
 from hjepa_cli.stages.report import (
     FIGURE_FORMATS,
     NO_RESULT,
@@ -394,8 +394,8 @@ def show(document: Mapping[str, Any], screen: Screen) -> None:
                     for w in windows
                 ),
                 span(entry["nmae_every_step"], entry["nmae_every_step_ci95"], 4),
-                _bounded(entry, "gap_steps", "gap", 1, "≥"),
-                _bounded(entry, "p", "p", 4, "≤"),
+                tolerance(entry, "gap_steps", "gap", 1, "≥"),
+                tolerance(entry, "p", "p", 4, "≤"),
             ]
             for name, entry in entries.items()
         ],
@@ -417,12 +417,6 @@ def show(document: Mapping[str, Any], screen: Screen) -> None:
             for one in found
         ],
     )
-
-
-def _bounded(entry: Entry, value: str, key: str, decimals: int, bound: str) -> str | None:
-    censored = entry[f"tolerance_{key}_censored"]
-    interval = entry[f"tolerance_{key}_ci95"]
-    return span(entry[f"tolerance_{value}"], interval, decimals, bound if censored else "")
 
 
 def _spanned(found: Mapping[str, Any] | None, decimals: int) -> str | None:

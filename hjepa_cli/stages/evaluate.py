@@ -24,7 +24,7 @@ from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.core.workers import cluster_runner, open_workers, single_thread
 from hjepa_cli.errors import MissingInputError, UsageError
-from hjepa_cli.screen import Screen, span
+from hjepa_cli.screen import Screen, in_order, tolerance
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
 from hjepa_cli.storage import curves, runs
@@ -75,6 +75,8 @@ def run(
             result = record.finish(curves_for(subject, screen, record, remeasure=remeasure))
         else:
             screen.say(f"{record.directory} is finished; this is its result")
+            for key in ("methods", "checkpoints"):  # stored in the order of the alphabet
+                result[key] = in_order(result.get(key, {}), settings.methods)
         show(result, screen)
         if figure:
             result["figures"] = draw(result, settings, record.directory, screen)
@@ -267,8 +269,8 @@ def show(result: dict[str, Any], screen: Screen) -> None:
                 _number(entry["score"], 3),
                 _number(entry["lq_ratio"], 3),
                 entry["bits_per_transmission"],
-                _tolerance(entry, "gap_steps", "gap", 1, "≥"),
-                _tolerance(entry, "p", "p", 4, "≤"),
+                tolerance(entry, "gap_steps", "gap", 1, "≥"),
+                tolerance(entry, "p", "p", 4, "≤"),
                 _number(entry["tolerance_gap_lq_steps"], 1),
             ]
             for name, entry in entries.items()
@@ -402,12 +404,3 @@ def _ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int],
 
 def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
-
-
-def _tolerance(entry: Entry, value_key: str, key: str, decimals: int, bound: str) -> str | None:
-    """``112.5 (104.1 – 118.0)``; ``≥ 320.0 (…)`` where the score is acceptable to the end."""
-    value = entry[f"tolerance_{value_key}"]
-    if value is None:
-        return None
-    interval = entry[f"tolerance_{key}_ci95"]
-    return span(value, interval, decimals, bound if entry[f"tolerance_{key}_censored"] else "")

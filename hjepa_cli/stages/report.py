@@ -14,7 +14,7 @@ from typing import Any
 from hjepa_cli import __version__, html
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen, span
+from hjepa_cli.screen import Screen, in_order, percent, span, tolerance
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
@@ -146,10 +146,13 @@ def describe(directory: Path, screen: Screen) -> tuple[list[str], Figures]:
 
 
 def inputs_of(environment: Mapping[str, Any]) -> list[str]:
-    """What a run was given, as flags; paths below this directory without it."""
+    """What a run was given, as flags; paths below this directory without it.
+
+    Further models (``checkpoint 2``) have no flag: the command finds them again.
+    """
     flags = []
     for name, given in environment["inputs"].items():
-        if isinstance(given, dict) and isinstance(given.get("path"), str):
+        if " " not in name and isinstance(given, dict) and isinstance(given.get("path"), str):
             path = Path(given["path"])
             here = path.is_relative_to(Path.cwd())
             flags += [f"--{name}", str(path.relative_to(Path.cwd()) if here else path)]
@@ -208,7 +211,7 @@ def encoder_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> lis
             f"{'≤' if name == 'actor_nrmse' else '≥'} {gate['threshold']:g}",
             "passed" if gate["passed"] else "FAILED",
         ]
-        for name, gate in in_order(result["gates"], states)
+        for name, gate in in_order(result["gates"], states).items()
     ]
     return [
         html.paragraph(f"Encoder {result['checkpoint']}, trained in {result['seconds']:.0f} s."),
@@ -236,7 +239,7 @@ def eval_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[s
     entries = in_order(result["methods"], config["methods"])
     if not entries:
         return [html.paragraph("No method was measured.")]
-    first = entries[0][1]
+    first = next(iter(entries.values()))
     tolerances = [
         [
             name,
@@ -246,11 +249,11 @@ def eval_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[s
             tolerance(entry, "gap_steps", "gap", 1, "≥"),
             tolerance(entry, "p", "p", 4, "≤"),
         ]
-        for name, entry in entries
+        for name, entry in entries.items()
     ]
     errors = [
         [name, *(f"{error:.4f}" for error in entry["nmae_windows"].values())]
-        for name, entry in entries
+        for name, entry in entries.items()
     ]
     windows = [f"{window} steps" for window in first["nmae_windows"]]
     return [
@@ -276,11 +279,6 @@ def _models(result: Mapping[str, Any]) -> list[str]:
     paths = result.get("checkpoints", {}).items()
     others = [f"{name}: {path}" for name, path in paths if path != result["checkpoint"]]
     return [html.paragraph(f"Of other models: {'; '.join(others)}.")] if others else []
-
-
-def in_order(named: Mapping[str, Any], first: Sequence[str]) -> list[tuple[str, Any]]:
-    """Pairs of name and value: those named ``first`` in that order, then the rest."""
-    return [(name, named[name]) for name in dict.fromkeys((*first, *named)) if name in named]
 
 
 def scale_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
@@ -327,11 +325,6 @@ def gained(found: Mapping[str, Any]) -> str:
     )
 
 
-def percent(ratio: float | None) -> str:
-    """1.38 → +38.0 %."""
-    return "unbounded" if ratio is None else f"{100 * (ratio - 1):+.1f} %"
-
-
 def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
     """Losses and health over training."""
     path = run / runs.METRICS
@@ -350,7 +343,7 @@ def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path
     """Score against gap and delivery, error against the horizon."""
     from hjepa_cli import figures
 
-    entries = dict(in_order(result["methods"], config["methods"]))
+    entries = in_order(result["methods"], config["methods"])
     step_s = plant(result["plant"]).step_s
     level = config["protocol"]["acceptable_score"]
     return {
@@ -383,12 +376,3 @@ SECTIONS: dict[str, tuple[Callable[..., list[str]], Callable[..., Figures]]] = {
     "eval": (eval_section, eval_figures),
     "scale": (scale_section, scale_figures),
 }
-
-
-def tolerance(
-    entry: Mapping[str, Any], value_key: str, key: str, decimals: int, beyond: str
-) -> str | None:
-    """A tolerance with its interval, marked where the measured range ended first."""
-    bound = beyond if entry[f"tolerance_{key}_censored"] else ""
-    interval = entry[f"tolerance_{key}_ci95"]
-    return span(entry[f"tolerance_{value_key}"], interval, decimals, bound)

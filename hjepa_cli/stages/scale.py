@@ -17,7 +17,7 @@ from hjepa_cli.core.cell import Cell, Need, Row, best_flat, gain
 from hjepa_cli.core.methods import FRAME_BITS
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import NumericalError
-from hjepa_cli.screen import Screen, span
+from hjepa_cli.screen import Screen, percent, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.evaluate import curves_for, measure_points
 from hjepa_cli.stages.subject import Subject, open_subject
@@ -305,8 +305,8 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
         paper = f"; the paper: up to +{result['paper_gain_percent']} %"  # over one-step TS-JEPA
         screen.result(
             f"{found['method']} over {found['over']} at {found['snr_db']:g} dB: "
-            f"{_percent(found['ratio'])} devices "
-            f"(95 % CI {' to '.join(_percent(end) for end in found['ratio_ci95'])})"
+            f"{percent(found['ratio'])} devices "
+            f"(95 % CI {' to '.join(percent(end) for end in found['ratio_ci95'])})"
             + (paper if found["over"] == "ts-jepa-1" else "")
         )
     for method, (row, *_) in ranked:
@@ -326,7 +326,3 @@ def _described(result: Mapping[str, Any]) -> str:
     scaled = result["law"] == "equal" and result["noise"] == "scaled"
     law = f"{result['law']} law{', scaled noise' if scaled else ''}"
     return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
-
-
-def _percent(ratio: float | None) -> str:
-    return "unbounded" if ratio is None else f"{100 * (ratio - 1):+.1f} %"
