@@ -66,6 +66,7 @@ SCHEDULERS = (
 FLAGS_OF_LAWS = {  # of `scale`; all others mean something under each law
     "--scheduler": ("scheduled",),
     "--uncertainty": ("scheduled",),
+    "--topology": ("scheduled",),
     "--power-margin-db": ("scheduled",),
     "--coherence-slots": ("scheduled",),
     "--seeds": ("scheduled",),

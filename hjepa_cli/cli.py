@@ -419,6 +419,7 @@ def scale(
         given = {
             "--scheduler": scheduler is not None,
             "--uncertainty": uncertainty is not None,
+            "--topology": topology is not None,
             "--power-margin-db": power_margin_db is not None,
             "--coherence-slots": coherence_slots is not None,
             "--seeds": seeds is not None,

@@ -3,6 +3,7 @@
 A flag that overrides a setting defaults to ``None``: not given. Its default is in the preset.
 """
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from hjepa_cli import completion
-from hjepa_cli.checks import METHODS, SCHEDULERS
+from hjepa_cli.checks import LARGEST_BANDWIDTH_HZ, METHODS, SCHEDULERS
 from hjepa_cli.settings import PLANTS, PRESETS
 
 FILES, DATA, MODEL, LOOP, RADIO = "Files", "Data", "Model", "Closed loop", "Radio cell"
@@ -32,22 +33,42 @@ def whole_number(minimum: int) -> Callable[[str], int]:
     return parse
 
 
-def number(minimum: float, maximum: float = float("inf")) -> Callable[[str], float]:
+def number(minimum: float, maximum: float = math.inf) -> Callable[[str], float]:
     """Return a parser of finite numbers of at least ``minimum``; NaN is refused."""
+    most = f" and at most {maximum:g}" if maximum < math.inf else ""
+    expected = f"of at least {minimum:g}{most}"
+    return _finite(expected, lambda value: minimum <= value <= maximum)
 
+
+def positive_number(maximum: float) -> Callable[[str], float]:
+    """Return a parser of numbers of more than 0 and at most ``maximum``."""
+    expected = f"of more than 0 and at most {maximum:g}"
+    return _finite(expected, lambda value: 0 < value <= maximum)
+
+
+def number_below_one() -> Callable[[str], float]:
+    """Return a parser of numbers of at least 0 and less than 1."""
+    return _finite("of at least 0 and less than 1", lambda value: 0 <= value < 1)
+
+
+def _finite(expected: str, accepts: Callable[[float], bool]) -> Callable[[str], float]:
     def parse(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
-            value = float("nan")
-        if not (minimum <= value <= maximum and value < float("inf")):
-            most = f" and at most {maximum:g}" if maximum < float("inf") else ""
-            raise typer.BadParameter(
-                f"'{text}' is not a finite number of at least {minimum:g}{most}"
-            )
+            value = math.nan
+        if not (math.isfinite(value) and accepts(value)):
+            raise typer.BadParameter(f"'{text}' is not a finite number {expected}")
         return value
 
     return parse
+
+
+def written_path(text: str | Path) -> Path:
+    """Parse a path to write to; an empty one, of an unset variable, would be this directory."""
+    if not str(text).strip():
+        raise typer.BadParameter("an empty path; leave the flag out, or name a place")
+    return Path(text)
 
 
 def one_of(*choices: str) -> Callable[[str], str]:
@@ -115,6 +136,7 @@ Out = Annotated[
         "Directory to write to (new, empty, or an earlier run to take up). "
         "Without it: the next free number below runs/ (collect: data/).",
         metavar="DIR",
+        parser=written_path,
     ),
 ]
 Dataset = Annotated[
@@ -270,6 +292,7 @@ FileOut = Annotated[
         "--out",
         "File to write; one that is there is replaced.",
         metavar="FILE",
+        parser=written_path,
     ),
 ]
 
@@ -336,7 +359,7 @@ PlantSpread = Annotated[
         "--plant-spread",
         "Relative spread of the masses between devices; 0: all are equal.",
         "FRACTION",
-        parser=number(0.0),
+        parser=number_below_one(),
     ),
 ]
 Payload = Annotated[
@@ -395,7 +418,13 @@ Law = Annotated[
 ]
 BandwidthMhz = Annotated[
     float | None,
-    _setting(RADIO, "--bandwidth-mhz", "Bandwidth of the cell.", "MHZ", parser=number(0.0)),
+    _setting(
+        RADIO,
+        "--bandwidth-mhz",
+        "Bandwidth of the cell.",
+        "MHZ",
+        parser=positive_number(LARGEST_BANDWIDTH_HZ / 1e6),
+    ),
 ]
 Noise = Annotated[
     str | None,
@@ -495,7 +524,13 @@ ComparedMethods = Annotated[
 ]
 ComparisonDirectory = Annotated[
     Path | None,
-    _plain(FILES, "--figures", "Draw the paper's Fig. 3 into this directory.", metavar="DIR"),
+    _plain(
+        FILES,
+        "--figures",
+        "Draw the paper's Fig. 3 into this directory.",
+        metavar="DIR",
+        parser=written_path,
+    ),
 ]
 ReportOut = Annotated[
     Path,
@@ -503,12 +538,19 @@ ReportOut = Annotated[
         "--out",
         help="HTML file to write; one that is there is replaced.",
         metavar="FILE",
+        parser=written_path,
         rich_help_panel=FILES,
     ),
 ]
 FigureDirectory = Annotated[
     Path | None,
-    _plain(FILES, "--figures", "Also write every figure into this directory.", metavar="DIR"),
+    _plain(
+        FILES,
+        "--figures",
+        "Also write every figure into this directory.",
+        metavar="DIR",
+        parser=written_path,
+    ),
 ]
 FigureFormats = Annotated[
     str,
@@ -553,13 +595,14 @@ ViewSnr = Annotated[
     ),
 ]
 Delivery = Annotated[
-    float,
+    float | None,
     typer.Option(
         "--delivery",
         help="Share of packets that arrive over the fading link.",
         metavar="P",
         parser=number(1e-6, 1 - 1e-6),
         rich_help_panel=RADIO,
+        show_default="0.05",
     ),
 ]
 Gap = Annotated[
@@ -598,6 +641,7 @@ AnimationOut = Annotated[
         "--out",
         help="File to write, .gif or .mp4; one that is there is replaced.",
         metavar="FILE",
+        parser=written_path,
         rich_help_panel=FILES,
     ),
 ]

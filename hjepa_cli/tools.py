@@ -9,6 +9,7 @@ import typer
 
 from hjepa_cli import options, plan
 from hjepa_cli.command import Result, execute, print_help, resolve
+from hjepa_cli.errors import UsageError
 from hjepa_cli.plan import Plan
 from hjepa_cli.screen import Screen
 
@@ -148,7 +149,7 @@ def view(
     methods: options.ViewMethods = "hjepa,hold",
     devices: options.ViewDevices = 3,
     snr: options.ViewSnr = 20.0,
-    delivery: options.Delivery = 0.05,
+    delivery: options.Delivery = None,
     gap: options.Gap = None,
     every: options.Every = None,
     fps: options.Fps = 20,
@@ -167,6 +168,11 @@ def view(
     debug: options.Debug = False,
 ) -> None:
     """Watch closed loops over a fading link: true pole, believed pole, packets, SNR, age."""
+    if gap is not None and delivery is not None:
+        raise UsageError(
+            "--gap is a link without fading, --delivery is of one with; give one of them",
+            hint=f"hjepa view --gap {gap:g}, or hjepa view --delivery {delivery:g}",
+        )
     settings = resolve(
         preset,
         config,
@@ -190,7 +196,7 @@ def view(
             out=out,
             devices=devices,
             snr_db=snr,
-            delivery=delivery,
+            delivery=0.05 if delivery is None else delivery,
             gap_steps=gap,
             every=every,
             fps=fps,

@@ -158,6 +158,7 @@ def test_a_plan_of_a_figure_refuses_models_of_different_seeds(shell, monkeypatch
         ("equal", ["--power-margin-db", "3"], "scheduled"),
         ("equal", ["--coherence-slots", "2"], "scheduled"),
         ("equal", ["--uncertainty", "levels"], "scheduled"),
+        ("duty", ["--topology", "target"], "scheduled"),
         ("duty", ["--noise", "scaled"], "equal"),
         ("scheduled", ["--remeasure"], "duty"),
         ("scheduled", ["--dataset", "data"], "duty"),
@@ -227,12 +228,31 @@ def test_numbers_are_finite_and_not_negative(shell, command, flag, value):
     refused(shell, 2, command, f"{flag}={value}", says=[flag, f"'{value}'"])
 
 
-def test_zero_bandwidth_carries_nothing(shell):
-    refused(shell, 2, "scale", "--bandwidth-mhz", "0", says=["bandwidth_hz", "more than 0"])
+@pytest.mark.parametrize("command", ["scale", "view"])
+@pytest.mark.parametrize("value", ["0", "-1", "1e6"])
+def test_a_bandwidth_is_more_than_nothing_and_that_of_a_radio(shell, command, value):
+    says = ["--bandwidth-mhz", f"'{value}'", "of more than 0 and at most 100000"]
+    refused(shell, 2, command, f"--bandwidth-mhz={value}", says=says)
 
 
 def test_a_spread_of_one_would_make_masses_vanish(shell):
-    refused(shell, 2, "eval", "--plant-spread", "1", says=["plant_spread", "less than 1"])
+    refused(shell, 2, "eval", "--plant-spread", "1", says=["--plant-spread", "less than 1"])
+
+
+@pytest.mark.parametrize(
+    "command",
+    [*PIPELINE, "reproduce", "view", "report", "data preview", "data export", "compare --figures"],
+)
+def test_an_empty_path_is_not_this_directory(shell, command):
+    words = command.split()
+    flag = words.pop() if "--" in command else "--out"
+    refused(shell, 2, *words, flag, "", says=[flag, "an empty path"])
+
+
+def test_a_view_takes_one_kind_of_link(shell):
+    both = ("view", "--gap", "5", "--delivery", "0.5")
+    refused(shell, 2, *both, says=["--gap", "--delivery", "give one"])
+    refused(shell, 2, *both, "--dry-run", says=["--gap", "--delivery", "give one"])
 
 
 @pytest.mark.parametrize("value", ["-1", "1.5", "nan", str(2**63)])

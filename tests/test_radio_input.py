@@ -65,8 +65,9 @@ def test_refused_by_the_functions(refused, message):
 @pytest.mark.parametrize(
     ("flags", "config", "message"),
     [
-        (("--bandwidth-mhz", "0"), "", "bandwidth_hz"),
-        (("--bandwidth-mhz", "-20"), "", "at least 0"),
+        (("--bandwidth-mhz", "0"), "", "--bandwidth-mhz"),
+        (("--bandwidth-mhz", "-20"), "", "of more than 0"),
+        ((), "bandwidth_hz = 0.0", "more than 0"),
         ((), "carrier_ghz = 0.4", "0.5 to 100"),
         ((), "carrier_ghz = 100.5", "0.5 to 100"),
         ((), 'scenario = "InF-XX"', "InF-SH"),
