@@ -168,6 +168,8 @@ def export(
 
     with screen.progress("export", len(recorded), "trajectories") as bar:
         filmed = exports.blocks(recorded, film, bar.advance) if pixels else None
+        if not pixels:  # nothing that takes time
+            bar.advance(len(recorded))
         if kind == "hdf5":
             exports.write_hdf5(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
         else:
@@ -248,17 +250,25 @@ def interval(ends: Sequence[float]) -> str:
 
 
 def chosen_format(out: Path | None, kind: str | None) -> str:
-    """The format that was named, else that of the file's suffix, else npz."""
-    if kind is None and out is not None:
-        kind = next((name for name, suffixes in FORMATS.items() if out.suffix in suffixes), None)
-    elif kind is None:
-        kind = "npz"
-    if kind is None:
+    """The format that was named, else that of the file's suffix, else npz.
+
+    Raises:
+        UsageError: the suffix is that of no format, or of another than the one that was named.
+    """
+    if out is None:
+        return kind or "npz"
+    meant = next((name for name, suffixes in FORMATS.items() if out.suffix in suffixes), None)
+    if kind and meant and kind != meant:
+        raise UsageError(
+            f"--format {kind} contradicts the suffix of {out}",
+            hint=f"--format {meant}, or --out {out.with_suffix(FORMATS[kind][0])}",
+        )
+    if not (kind or meant):
         raise UsageError(
             f"no export format has the suffix of {out}",
             hint="--format hdf5 or --format npz; or --out FILE.h5 or FILE.npz",
         )
-    return kind
+    return kind or str(meant)
 
 
 def plan_export(

@@ -156,12 +156,17 @@ def test_stored_frames_are_exported_as_they_are(shell):
 def test_export_without_pixels(shell):
     arrays, _ = exported(shell, "new/folder/a.npz", "--no-pixels")
     assert set(arrays) == COLUMNS - {"pixels"}
+    outcome = shell("data", "export", "--no-pixels", "--out", "a.npz")
+    assert "export 3/3 (100 %)" in outcome.err
 
 
 def test_bad_exports_are_refused_before_anything_is_written(shell):
     with shell.untouched():
         assert_one_line_error(shell("data", "export", "--out", "a.mat"), 2, "a.mat", "npz")
         assert_one_line_error(shell("data", "export", "--format", "zarr"), 2, "zarr", "hdf5")
+        for kind, name, hint in (("npz", "a.hdf5", "a.npz"), ("hdf5", "a.npz", "a.h5")):
+            outcome = shell("data", "export", "--format", kind, "--out", name)
+            assert_one_line_error(outcome, 2, f"--format {kind}", name, f"--out {hint}")
         assert_one_line_error(shell("data", "export", "--split", "val"), 2, "val", "train, test")
         assert_one_line_error(shell("data", "preview", "--rows", "0"), 2, "--rows")
         assert_one_line_error(shell("data", "preview", "--out", "a.jpg"), 2, ".jpg", "FILE.png")
