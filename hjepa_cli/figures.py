@@ -204,6 +204,11 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def has_curves(figure: Figure) -> bool:
+    """Whether anything is drawn that a legend would name."""
+    return any(axes.get_legend_handles_labels()[1] for axes in figure.axes)
+
+
 def encoded(figure: Figure, kind: str) -> bytes:
     """A figure as ``"png"``, ``"svg"`` or ``"pdf"``."""
     buffer = io.BytesIO()
@@ -435,6 +440,8 @@ def _finish(figure: Figure, axes: Axes, title: str) -> None:
 
 def _legend(figure: Figure, axes: Axes) -> None:
     """Below the axes, in as many columns as the column of a paper has room for."""
-    longest = max((len(label) for label in axes.get_legend_handles_labels()[1]), default=0)
+    if not has_curves(figure):
+        return
+    longest = max(len(label) for label in axes.get_legend_handles_labels()[1])
     ncols = 3 if longest <= LONGEST_OF_THREE else 2
     figure.legend(loc="outside lower center", ncols=ncols, frameon=False, handlelength=2.4)

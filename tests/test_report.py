@@ -322,6 +322,18 @@ def test_error_figure_leaves_out_who_makes_no_error():
     assert figure.axes[0].get_ylim()[0] > 1e-3
 
 
+def test_a_report_of_those_who_make_no_error_has_no_empty_figure(shell):
+    """Nor a warning about a legend without names: warnings are errors here."""
+    exact = entry(1.0) | {"nmae": [1e-8] * 3, "nmae_ci95": [[0, 1e-8]] * 3}
+    unlinked = exact | {"tolerance_gap_steps": None}
+    for name, methods, count in (("o", {"oracle": exact}, 2), ("p", {"optimal": unlinked}, 0)):
+        finished("eval", {"plant": "desktop", "seed": 0, "checkpoint": None, "methods": methods},
+                 name=name)  # fmt: skip
+        outcome = shell("report", f"runs/eval/{name}")
+        assert (outcome.code, "Warning" in outcome.err) == (0, False)
+        assert Path("report.html").read_text().count("<img") == count
+
+
 def test_training_figure_has_a_line_per_loss_level_and_health_measure():
     rows = [{"step": "1", "loss_a": "0.5", "loss_b": "2", "probe_r2_x": "0.9", "std": "1"}]
     figure = figures.training_figure(rows)

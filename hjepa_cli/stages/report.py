@@ -340,13 +340,13 @@ def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
 
 
 def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
-    """Score against gap and delivery, error against the horizon."""
+    """Score against gap and delivery, error against the horizon; none that would be empty."""
     from hjepa_cli import figures
 
     entries = in_order(result["methods"], config["methods"])
     step_s = plant(result["plant"]).step_s
     level = config["protocol"]["acceptable_score"]
-    return {
+    drawn = {
         "gap": (
             "Normalised score against the time between packets, 95 % bands",
             figures.score_figure(entries, "gap", acceptable_score=level, step_s=step_s),
@@ -359,6 +359,9 @@ def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path
             "Error of the predicted force after a single packet, 95 % bands",
             figures.error_figure(entries, step_s=step_s),
         ),
+    }
+    return {
+        name: (text, figure) for name, (text, figure) in drawn.items() if figures.has_curves(figure)
     }
 
 
