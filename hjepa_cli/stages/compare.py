@@ -75,8 +75,8 @@ def run(
         screen: where to say so.
         paths: runs of ``eval``, or directories that hold some; none: ``runs/eval``.
         methods: these, in this order, the first against the others; default: all that were found.
-        figures: also draw the paper's Fig. 3 with bands over trainings into this directory,
-        formats: in these formats.
+        figures: also draw the paper's Fig. 3 with bands over trainings into this directory.
+        formats: of this figure.
 
     Raises:
         UsageError: no such method.

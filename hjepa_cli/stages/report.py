@@ -41,8 +41,8 @@ def run(
         screen: where to say so.
         paths: run directories, or directories that hold some; none: the newest of each stage.
         out: the HTML file.
-        figures: also write every figure into this directory,
-        formats: in these formats.
+        figures: also write every figure into this directory.
+        formats: of these figures.
 
     Raises:
         MissingInputError: no run there, or an unfinished one.
