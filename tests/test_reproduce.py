@@ -109,8 +109,8 @@ def test_dry_run_plans_all_stages_and_writes_nothing(shell, preset):
 @pytest.mark.parametrize(
     ("flags", "config", "says"),
     [
-        (["--methods", "hjepa,ts-jepa-7"], "", ["ts-jepa-7", "train-hierarchy --h 7", "ts-jepa-4"]),
-        (["--methods", "hjepa,supervised-2"], "", ["supervised-2", "--method supervised"]),
+        (["--methods", "ts-jepa-7"], "", ["ts-jepa-7", "train-hierarchy --h 7", "ts-jepa-4"]),
+        (["--methods", "supervised-2"], "", ["supervised-2", "--method supervised"]),
         (["--methods", "hjepa"], "[hierarchy]\nh = 1\nm = 1\nl = 1", ["hjepa", "ts-jepa-1"]),
         ([], '[encoder]\nmethod = "supervised"', ["'supervised'", "'jepa'"]),
         ([], "[collect]\nsteps = 4", ["4 steps"]),
@@ -142,6 +142,17 @@ def test_the_methods_it_serves_are_those_of_the_models_it_trains():
     assert served(None, 8, 2, 1) == always | {"hjepa", "ts-jepa-8", "state-48"}
     assert served(None, 7, 7, 7) == always | {"ts-jepa-7", "state-48"}
     assert served("quadrotor", 1, 1, 1) == always
+
+
+def test_methods_of_other_models_are_left_out(shell, calls):
+    """So that a preset's methods go with other strides; the zoo's models stay the zoo's."""
+    outcome = shell("reproduce", "--methods", "hjepa,ts-jepa-7,supervised-2,oracle")
+    assert outcome.code == 0
+    for name in ("ts-jepa-7", "supervised-2"):
+        assert f"{name} left out" in outcome.err
+    inputs = dict(calls[1:])
+    for stage in ("eval", "scale"):
+        assert inputs[stage]["settings"].methods == ("hjepa", "oracle")
 
 
 def test_the_stages_take_what_they_are_given():

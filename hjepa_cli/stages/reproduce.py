@@ -5,6 +5,7 @@ stage reads what the one before it left in the folder and nothing else; the same
 ``--out`` and the folder goes on after the last finished stage.
 """
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,8 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
         folder = record.directory
         if settings.preset == report.SMOKE:
             screen.say(report.NO_RESULT)
+        for name in left_out(settings):
+            screen.say(f"{name} left out, no model of it is trained here")
         work = stages(settings, screen, folder)
         parts = plan.reproduce_parts(settings)
         expected_s = {name: round(seconds) for name, (_, seconds) in parts.items()}
@@ -66,7 +69,7 @@ def check(settings: Settings) -> None:
     """Refuse at once what a late stage would refuse after the others have worked for it.
 
     Raises:
-        UsageError: a baseline in place of the encoder, a method of which no model is trained here,
+        UsageError: a baseline in place of the encoder, no method of which a model is trained here,
             trajectories too short for the strides or the horizon, a bad SNR grid.
     """
     method, collected = settings.encoder.method, settings.collect
@@ -75,16 +78,22 @@ def check(settings: Settings) -> None:
             f"encoder.method = {method!r}; reproduce trains a hierarchy, which needs 'jepa'",
             hint=f"hjepa train-encoder --method {method}",
         )
-    served = servable(settings)
-    if missing := [name for name in settings.methods if name not in served]:
+    missing = left_out(settings)
+    if len(missing) == len(settings.methods):
         raise UsageError(
             f"no model of {', '.join(missing)} is trained here; "
-            f"choose --methods from {', '.join(served)}",
-            hint=f"leave it out, or train it on its own: {how_to_train(missing[0], settings)}",
+            f"choose --methods from {', '.join(servable(settings))}",
+            hint=f"train it on its own: {how_to_train(missing[0], settings)}",
         )
     check_stride(max(settings.encoder.h, settings.hierarchy.h), collected.steps)
     check_horizon(settings.protocol.horizon, collected.clean_steps)
     parse_snr(settings.radio.snr_db)
+
+
+def left_out(settings: Settings) -> list[str]:
+    """The methods of the settings that no model drives which is trained here."""
+    served = servable(settings)
+    return [name for name in settings.methods if name not in served]
 
 
 def servable(settings: Settings) -> tuple[str, ...]:
@@ -98,6 +107,8 @@ def servable(settings: Settings) -> tuple[str, ...]:
 def stages(settings: Settings, screen: Screen, folder: Path) -> dict[str, Callable[[], Result]]:
     """The five stages, each bound to what it reads and writes in ``folder``."""
     data, model = folder / "data", str(folder / "train-hierarchy")
+    driven = tuple(name for name in settings.methods if name not in left_out(settings))
+    measured = dataclasses.replace(settings, methods=driven)
 
     def trained_hierarchy() -> Result:
         return train_hierarchy.run(
@@ -115,9 +126,9 @@ def stages(settings: Settings, screen: Screen, folder: Path) -> dict[str, Callab
         ),
         "train-hierarchy": trained_hierarchy,
         "eval": lambda: evaluate.run(
-            settings, screen, checkpoint=model, dataset=data, out=folder / "eval"
+            measured, screen, checkpoint=model, dataset=data, out=folder / "eval"
         ),
         "scale": lambda: scale.run(
-            settings, screen, checkpoint=model, dataset=data, out=folder / "scale"
+            measured, screen, checkpoint=model, dataset=data, out=folder / "scale"
         ),
     }
