@@ -6,6 +6,7 @@ Controllers, teachers and the oracle's equations stay the nominal ones: nobody t
 
 import dataclasses
 import zlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,11 @@ _VARIED_KEY = 0x11B7
 _SPLITS = ("train", "test")
 
 
-def altered(settings: Settings) -> dict[str, float]:
-    """The conditions that are not nominal."""
-    conditions = settings.as_dict()["conditions"]
-    return {key: value for key, value in conditions.items() if value != NOMINAL[key]}
+def altered(settings: Mapping[str, Any]) -> dict[str, float]:
+    """The conditions that are not nominal, of settings as ``as_dict`` gives them or a file holds
+    them."""
+    conditions = settings.get("conditions", {})
+    return {key: value for key, value in conditions.items() if value != NOMINAL.get(key)}
 
 
 def actual_plant(settings: Settings) -> System:

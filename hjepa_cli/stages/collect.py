@@ -81,7 +81,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
         "seed": settings.seed,
         "collect": settings.as_dict()["collect"] | {"plant": settings.plant},
     }
-    if conditions := altered(settings):  # clean rollouts are of such devices
+    if conditions := altered(settings.as_dict()):  # clean rollouts are of such devices
         definition["conditions"] = conditions
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():

@@ -81,8 +81,8 @@ class Digest:
             collected = source["collect"]
             clean = [source["seed"], *(collected[key] for key in CLEAN)]
             clean += collected.get("start", [])
-            conditions = altered(settings)
-            if dataset is not None and (theirs := source.get("conditions", {})) != conditions:
+            conditions = altered(values)
+            if (theirs := altered(source)) != conditions:
                 clean.append(theirs)
         except (LookupError, TypeError, AttributeError):
             raise DataError(
