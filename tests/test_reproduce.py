@@ -117,6 +117,7 @@ def test_dry_run_plans_all_stages_and_writes_nothing(shell, preset):
         (["--methods", "hjepa"], "[hierarchy]\nh = 100", ["--h 100"]),
         ([], "[protocol]\nhorizon = 120", ["horizon = 120"]),
         ([], '[radio]\nsnr_db = "30:10"', ["--snr"]),
+        (["--methods", "optimal,local"], '[radio]\nlaw = "scheduled"', ["nothing to schedule"]),
     ],
 )
 @pytest.mark.parametrize("how", [[], ["--dry-run"]], ids=str)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli import plan
-from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.checks import LINKLESS, TRUE_STATE
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.model import offered
 from hjepa_cli.core.plant import plant
@@ -69,8 +69,9 @@ def check(settings: Settings) -> None:
     """Refuse at once what a late stage would refuse after the others have worked for it.
 
     Raises:
-        UsageError: a baseline in place of the encoder, no method of which a model is trained here,
-            trajectories too short for the strides or the horizon, a bad SNR grid.
+        UsageError: a baseline in place of the encoder, no method of which a model is trained here or
+            that has a link to schedule, trajectories too short for the strides or the horizon, a
+            bad SNR grid.
     """
     method, collected = settings.encoder.method, settings.collect
     if method != "jepa":
@@ -84,6 +85,11 @@ def check(settings: Settings) -> None:
             f"no model of {', '.join(missing)} is trained here; "
             f"choose --methods from {', '.join(servable(settings))}",
             hint=f"train it on its own: {how_to_train(missing[0], settings)}",
+        )
+    if settings.radio.law == "scheduled" and not set(settings.methods) - {*missing, *LINKLESS}:
+        raise UsageError(
+            f"law scheduled has nothing to schedule for {', '.join(settings.methods)}",
+            hint="choose --methods that have a link, as hjepa, or radio.law = 'duty'",
         )
     check_stride(max(settings.encoder.h, settings.hierarchy.h), collected.steps)
     check_horizon(settings.protocol.horizon, collected.clean_steps)
