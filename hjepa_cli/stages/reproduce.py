@@ -69,8 +69,8 @@ def check(settings: Settings) -> None:
     """Refuse at once what a late stage would refuse after the others have worked for it.
 
     Raises:
-        UsageError: a baseline in place of the encoder, no method of which a model is trained here or
-            that has a link to schedule, trajectories too short for the strides or the horizon, a
+        UsageError: a baseline in place of the encoder, no method of which a model is trained here
+            or that has a link to schedule, trajectories too short for the strides or the horizon, a
             bad SNR grid.
     """
     method, collected = settings.encoder.method, settings.collect
