@@ -92,22 +92,24 @@ def test_at_the_index_as_price_sending_now_or_a_slot_later_cost_the_same(age):
     assert mean_cost(age) < mean_cost(age + 2)
 
 
-def test_conformal_quantile_covers_new_devices():
+@pytest.mark.parametrize("scale", [[1.0, 2.0, 3.0], [2.0, 1.0, 3.0]], ids=["rising", "not"])
+def test_conformal_quantile_covers_new_devices(scale):
     random = np.random.default_rng(0)
     ages, inside = (1, 4, 9), []
-    scale = np.sqrt(np.array(ages))
     for _ in range(400):
         growth = conformal_growth(ages, np.abs(random.normal(size=(19, 3))) * scale, 0.9)
         fresh = np.abs(random.normal(size=3)) * scale
         inside.append(fresh**2 <= growth.at(ages))
-    # Rank 18 of 19 covers 0.9 exactly; isotonic pooling shifts little. 4 standard errors of 400.
-    assert np.mean(inside, axis=0) == pytest.approx(np.full(3, 0.9), abs=4 * 0.015)
+    # Rank 18 of 19 covers 0.9 exactly; the monotone table never less. 4 standard errors of 400.
+    covered = np.mean(inside, axis=0)
+    assert np.all(covered >= 0.9 - 4 * 0.015)
+    assert covered[0] == pytest.approx(0.9, abs=4 * 0.015)
 
 
 def test_growth_is_monotone_and_interpolated():
     growth = conformal_growth((2, 4, 6), np.tile([1.0, 0.5, 3.0], (20, 1)))
     assert np.all(np.diff(growth.table) >= 0)
-    assert growth.at(2) == pytest.approx(0.75**2) and growth.at(1) == pytest.approx(0.375**2)
+    assert growth.at([1, 2, 4, 6]) == pytest.approx([0.25, 1.0, 1.0, 9.0])
     with pytest.raises(UsageError, match="9 or more"):
         conformal_growth((1,), np.ones((8, 1)))
 
