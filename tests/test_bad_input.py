@@ -354,6 +354,7 @@ def test_config_that_is_a_directory(shell):
 
 
 def write_tiny_dataset(directory, plant_name):
+    from hjepa_cli.core.camera import Camera
     from hjepa_cli.storage.datasets import Trajectories, write_dataset
 
     rng = np.random.default_rng(1)
@@ -371,7 +372,7 @@ def write_tiny_dataset(directory, plant_name):
         settings=load_settings("gym" if plant_name == "gym" else None).as_dict(),
         splits={"train": split(2, 12), "test": split(2, 12), "clean": split(1, 14)},
         plant_name=plant_name,
-        camera_manifest={"version": 1},
+        camera_manifest=Camera(plant_name).manifest(),
     )
     return directory
 
@@ -427,6 +428,13 @@ def test_no_dataset_yet_names_the_command_that_makes_one(shell):
 def test_no_encoder_yet_names_the_command_that_makes_one(shell, dataset, monkeypatch):
     monkeypatch.setattr("hjepa_cli.storage.zoo.list_models", list)
     refused(shell, 66, "train-hierarchy", says=["hjepa train-encoder"])
+
+
+def test_pictures_of_another_camera(shell, dataset, monkeypatch):
+    """Dataset and model were made before the camera changed."""
+    monkeypatch.setattr("hjepa_cli.core.camera.VERSION", 2)
+    refused(shell, 65, "train-encoder", says=["another camera", "hjepa collect"])
+    refused(shell, 65, "eval", "--checkpoint", "desktop-h4m2l1", says=["another camera", "train"])
 
 
 @pytest.mark.parametrize("damage", ["truncate", "flip", "remove"])

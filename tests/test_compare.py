@@ -31,7 +31,8 @@ def entry(method, seed):
 def evaluated(training, methods=("hjepa", "ts-jepa-4", "oracle"), name=None, **changes):
     """A finished run of eval, of models that were trained with seed ``training``."""
     settings = load_settings().as_dict()
-    settings["protocol"] |= changes.pop("protocol", {})
+    for section in ("protocol", "collect"):
+        settings[section] |= changes.pop(section, {})
     result = {
         "plant": "desktop",
         "seed": 0,
@@ -114,6 +115,8 @@ def test_the_figure_has_every_method_and_its_band(shell):
         ({"loop_version": 1}, ("loop_version is 2", "1 in")),
         ({"protocol": {"steps": 250}}, ("protocol.steps is 1000", "250 in")),
         ({"horizon": [0, 1]}, ("horizon",)),
+        ({"collect": {"x_m": 0.3}}, ("collect.x_m", "0.3 in")),
+        ({"collect": {"start": [0.1, 0.2, 0.1, 0.2]}}, ("collect.start",)),
         (
             {"training_seeds": {"hjepa": 1, "ts-jepa-4": 2}},
             ("different seeds", "hjepa: 1, ts-jepa-4: 2"),

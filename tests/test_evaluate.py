@@ -20,6 +20,7 @@ import torch
 
 from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core import executors
+from hjepa_cli.core import plant as plant_module
 from hjepa_cli.core import workers as workers_module
 from hjepa_cli.core.bench import Bench, control_entry, control_errors, errors_at_every_step
 from hjepa_cli.core.camera import Camera
@@ -33,7 +34,7 @@ from hjepa_cli.core.policy import teacher
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.sensors import embedding_sensor
 from hjepa_cli.core.simulator import BLOCK_DEVICES, Block, Simulator, Tick, run_points
-from hjepa_cli.core.workers import open_workers, single_thread
+from hjepa_cli.core.workers import ModelFile, open_workers, simulate, single_thread
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
@@ -69,7 +70,7 @@ def small(
     )
 
 
-def untrained(path: Path, plant_name: str = "desktop", h: int = 4) -> Path:
+def untrained(path: Path, plant_name: str = "desktop", h: int = 4, seed: int = 0) -> Path:
     """A checkpoint of random networks, as train-hierarchy writes it."""
     settings = load_settings(flags={"encoder.hidden": 32})
     architecture = describe_architecture(settings) | {
@@ -80,7 +81,7 @@ def untrained(path: Path, plant_name: str = "desktop", h: int = 4) -> Path:
         "actor_hidden": 32,
         "actor_dropout": 0.0,
     }
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     modules = build_modules(architecture)
     metadata = {
         "architecture": architecture,
@@ -385,6 +386,37 @@ def test_curves_of_another_digest_are_not_there(tmp_path: Path) -> None:
     assert curves.Digest.of("model", settings, dataset=settings.as_dict()) == digest
 
 
+@pytest.mark.parametrize("payload", ["int8", "pca-8x6"])
+def test_anchors_are_fitted_to_the_ranges_of_the_settings(tmp_path: Path, payload: str) -> None:
+    """Not to the dataset's, whose clean rollouts are used: both make a difference."""
+    settings, path = small(payload=payload), tmp_path / "curves.json"
+    collect = dataclasses.replace(settings.collect, theta_rad=2 * settings.collect.theta_rad)
+    wider = dataclasses.replace(settings, collect=collect)
+    dataset = settings.as_dict()
+    digest = curves.Digest.of("model", settings, dataset)
+    curves.write(path, digest, {"hjepa": entry_of(0.5), "state-48": entry_of(0.4)})
+    found = curves.read(path, curves.Digest.of("model", wider, dataset))
+    assert sorted(found) == ([] if payload == "pca-8x6" else ["hjepa"])
+
+
+def test_a_plant_of_ones_own_is_measured_again_when_it_has_changed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A module of systems/, or another cart-pole."""
+    settings = load_settings("quadrotor")
+    before = curves.Digest.of("model", settings)
+    assert curves.Digest.of("model", settings) == before
+    monkeypatch.setattr(plant_module.systems, "source_sha256", lambda name: f"{name}, heavier")
+    assert curves.Digest.of("model", settings) != before
+
+    digests, settings = set(), dataclasses.replace(small(), plant="mine")
+    for mass_kg in (0.1, 0.2):
+        mine = dataclasses.replace(plant("desktop"), name="mine", pole_mass_kg=mass_kg)
+        monkeypatch.setattr(plant_module, "PLANTS", {"mine": mine})
+        digests.add(curves.Digest.of("model", settings))
+    assert len(digests) == 2
+
+
 @pytest.mark.parametrize(
     "key", ["trajectories", "test_trajectories", "steps", "exploration_n", "exploration_hold_steps"]
 )
@@ -509,7 +541,7 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
     settings = small(steps=8)
     model = Model.load(checkpoint, "cpu")
     ticks: list[int] = []
-    with open_workers(settings, checkpoint, 2) as workers:
+    with open_workers(settings, ModelFile(checkpoint, model.digest), 2) as workers:
         for name in ("oracle", "hjepa"):
             points = [Point("gap", 3.0)]
             theirs = run_points(workers, name, points, 4, ticks.append)
@@ -522,6 +554,19 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
         assert run_points(workers, "oracle", points, 4, ticks.append).cost == pytest.approx(
             run_points(Simulator(settings, model), "oracle", points, 4, ticks.append).cost
         )
+
+
+def test_a_worker_that_outlives_commands_does_not_drive_an_old_model(tmp_path: Path) -> None:
+    """As the workers of a cluster do, when training has written another model to the path."""
+    settings, block = small(steps=8), Block("hjepa", (Point("gap", 3.0),), 0, 2)
+    path, costs = tmp_path / "model.safetensors", []
+    for seed in (0, 1):
+        untrained(path, seed=seed)
+        model = ModelFile(path, Model.load(path, "cpu").digest)
+        costs.append(simulate(settings, model, block).cost)
+    assert not np.array_equal(*costs)
+    with pytest.raises(DataError, match="another model here"):
+        simulate(settings, ModelFile(path, "0" * 64), block)
 
 
 def test_a_dead_worker_is_reported_and_none_is_left_behind() -> None:
@@ -593,18 +638,19 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
 def test_eval_uses_workers_where_they_are_worth_it(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[Path | None, int]] = []
+    asked: list[tuple[ModelFile | None, int]] = []
+    driven = ModelFile(checkpoint.absolute(), Model.load(checkpoint, "cpu").digest)
 
     @contextlib.contextmanager
-    def fake(settings: Settings, model_path: Path | None, count: int) -> Iterator[Simulator]:
-        asked.append((model_path, count))
+    def fake(settings: Settings, model: ModelFile | None, count: int) -> Iterator[Simulator]:
+        asked.append((model, count))
         yield Simulator(settings, None)
         asked.append((None, 0))
 
     monkeypatch.setattr(evaluate, "open_workers", fake)
     for available, worth, expected in (
-        (2, 24 * 4, [(checkpoint, 2), (None, 0)]),
-        (64, 24 * 4, [(checkpoint, 8), (None, 0)]),
+        (2, 24 * 4, [(driven, 2), (None, 0)]),
+        (64, 24 * 4, [(driven, 8), (None, 0)]),
         (2, 24 * 4 + 1, []),
         (1, 1, []),
     ):

@@ -21,6 +21,7 @@ from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.frame_policies import read_frames
 from hjepa_cli.core.hierarchy import Strides, build_predictors, hold, plan_stride
 from hjepa_cli.core.plant import plant
+from hjepa_cli.core.system import same_camera
 from hjepa_cli.core.training import autocast, compute_dtype, resolve_device
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
@@ -112,10 +113,17 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
     Nothing is allocated before the tensors in the file are known to be those of the architecture.
 
     Raises:
-        DataError: there is no such architecture, or the tensors do not fit it.
+        DataError: there is no such architecture, the tensors do not fit it, or the camera has
+            changed since.
     """
     metadata = check_metadata(checkpoint)
     architecture, kind = metadata["architecture"], plant(metadata["plant"])
+    if "camera" in metadata and not same_camera(metadata["camera"], kind):
+        raise DataError(
+            f"checkpoint {checkpoint.path} was trained on another camera's pictures than plant "
+            f"{kind.name} has now",
+            hint="train it again",
+        )
     largest = max((array.size for array in checkpoint.tensors.values()), default=0)
     for name, value in architecture.items():
         if isinstance(value, int) and value > largest:

@@ -31,6 +31,7 @@ from hjepa_cli.settings import Settings
 if TYPE_CHECKING:
     from hjepa_cli.core.camera import Camera
 
+VERSIONED = ("desktop", "gym")
 TRACK_M = 1e4  # half length of the groove: out of reach
 SCORE_X_M = 0.05
 SCORE_THETA_RAD = 0.05
@@ -151,6 +152,16 @@ def plant(name: str) -> System:
         return systems.load(name)
     choices = ", ".join([*PLANTS, *systems.NAMES])
     raise UsageError(f"unknown plant '{name}'; choose one of {choices}")
+
+
+def definition(name: str) -> str | None:
+    """What measurements on a plant depend on: its numbers, or the digest of its module.
+
+    ``None`` for the plants of the zoo: :data:`hjepa_cli.core.loop.LOOP_VERSION` tells theirs apart.
+    """
+    if name in VERSIONED:
+        return None
+    return repr(PLANTS[name]) if name in PLANTS else systems.source_sha256(name)
 
 
 def plant_of(settings: Settings) -> System:

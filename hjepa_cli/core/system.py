@@ -7,6 +7,7 @@ The cart-poles (:class:`hjepa_cli.core.plant.Plant`) are systems, and so is ever
 """
 
 import abc
+import json
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar, Protocol
@@ -113,6 +114,11 @@ class Camera(Protocol):
         lean matters.
         """
         ...
+
+
+def same_camera(recorded: object, system: "System") -> bool:
+    """Whether pictures are those of the system's camera, by the manifest that a file holds."""
+    return bool(recorded == json.loads(json.dumps(system.camera().manifest())))
 
 
 class System(abc.ABC):

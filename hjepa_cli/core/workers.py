@@ -3,6 +3,7 @@
 A control step is many small operations on few devices, which threads do not speed up; processes do.
 """
 
+import dataclasses
 import functools
 import multiprocessing
 import threading
@@ -18,18 +19,37 @@ from hjepa_cli.core.executors import broken_pool_reported, prepare_worker, worke
 from hjepa_cli.core.loop import Outcome
 from hjepa_cli.core.model import Model
 from hjepa_cli.core.simulator import Block, Runner, Simulator, Tick
+from hjepa_cli.errors import DataError
 from hjepa_cli.settings import Settings
 
 TICK_S = 0.2  # between looks at the workers' progress
 
 
+@dataclasses.dataclass(frozen=True)
+class ModelFile:
+    """A checkpoint that workers load: where it is, and its digest when the command read it."""
+
+    path: Path
+    digest: str
+
+    def load(self, device: str) -> Model:
+        """Raise DataError if the file has changed since."""
+        model = Model.load(self.path, device)
+        if model.digest != self.digest:
+            raise DataError(
+                f"{self.path} is another model here than the command was given",
+                hint="let the training that writes it end; workers must see the same files",
+            )
+        return model
+
+
 @contextmanager
-def open_workers(settings: Settings, model_path: Path | None, count: int) -> Iterator[Runner]:
+def open_workers(settings: Settings, model: ModelFile | None, count: int) -> Iterator[Runner]:
     """A runner over ``count`` processes of this machine.
 
     Args:
         settings: as for :class:`~hjepa_cli.core.simulator.Simulator`.
-        model_path: checkpoint of the model; each worker loads it.
+        model: each worker loads it.
         count: processes.
 
     Raises:
@@ -49,10 +69,10 @@ def open_workers(settings: Settings, model_path: Path | None, count: int) -> Ite
             told = now
 
     with worker_pool(count, _start, done) as pool:
-        yield _runner(pool, settings, model_path, follow)
+        yield _runner(pool, settings, model, follow)
 
 
-def cluster_runner(executor: Executor, settings: Settings, model_path: Path | None) -> Runner:
+def cluster_runner(executor: Executor, settings: Settings, model: ModelFile | None) -> Runner:
     """A runner over any executor, whose workers see the model's file under the same path."""
 
     def follow(futures: Sequence[Future[Outcome]], blocks: Sequence[Block], tick: Tick) -> None:
@@ -63,7 +83,7 @@ def cluster_runner(executor: Executor, settings: Settings, model_path: Path | No
         for future in as_completed(futures):
             tick(loops[future] * settings.protocol.steps)
 
-    return _runner(executor, settings, model_path and model_path.absolute(), follow)
+    return _runner(executor, settings, model, follow)
 
 
 def single_thread(runner: Runner) -> Runner:
@@ -84,11 +104,11 @@ Follow = Callable[[Sequence[Future[Outcome]], Sequence[Block], Tick], None]
 
 
 def _runner(
-    executor: Executor, settings: Settings, model_path: Path | None, follow: Follow
+    executor: Executor, settings: Settings, model: ModelFile | None, follow: Follow
 ) -> Runner:
     def run(blocks: Sequence[Block], tick: Tick) -> list[Outcome]:
         with broken_pool_reported():
-            futures = [executor.submit(simulate, settings, model_path, block) for block in blocks]
+            futures = [executor.submit(simulate, settings, model, block) for block in blocks]
             follow(futures, blocks, tick)
             return [future.result() for future in futures]
 
@@ -106,16 +126,17 @@ def _start(done: "Synchronized[int]") -> None:
     _done = done
 
 
-def simulate(settings: Settings, model_path: Path | None, block: Block) -> Outcome:
+def simulate(settings: Settings, model: ModelFile | None, block: Block) -> Outcome:
     """Simulate one block in a worker, in one thread; the model is loaded with the first."""
     with _one_at_a_time:
         torch.set_num_threads(1)
-        return _simulator(settings, model_path).run(block, _tick)
+        return _simulator(settings, model).run(block, _tick)
 
 
 @functools.lru_cache(maxsize=1)
-def _simulator(settings: Settings, model_path: Path | None) -> Simulator:
-    return Simulator(settings, Model.load(model_path, settings.device) if model_path else None)
+def _simulator(settings: Settings, model: ModelFile | None) -> Simulator:
+    # The workers of a cluster outlive commands: the digest tells a model from one trained since.
+    return Simulator(settings, model.load(settings.device) if model else None)
 
 
 def _tick(steps: int) -> None:

@@ -216,7 +216,7 @@ def check_alike(found: Sequence[Evaluation]) -> None:
         named += [
             (first, f"collect.{key}", first.config["collect"].get(key), value)
             for key, value in other.config["collect"].items()
-            if key in curves.CLEAN
+            if key in (*curves.CLEAN, "start")
         ]
         # Draws may differ from training to training; within one they are what methods share.
         if other.training_seed is not None:

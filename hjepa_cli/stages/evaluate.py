@@ -22,7 +22,7 @@ from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
-from hjepa_cli.core.workers import cluster_runner, open_workers, single_thread
+from hjepa_cli.core.workers import ModelFile, cluster_runner, open_workers, single_thread
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.screen import Screen, in_order, tolerance
 from hjepa_cli.settings import Settings
@@ -330,16 +330,18 @@ def _measure(
 def _runner(subject: Subject) -> Iterator[Runner]:
     """Simulate in one process per core, or in this one where that is enough."""
     settings, count = subject.settings, min(cores(), MAX_WORKERS)
-    where = placement()
+    where, model = placement(), None
+    if subject.path and subject.model:
+        model = ModelFile(subject.path.absolute(), subject.model.digest)
     if where.workers is None:
         several = count > 1 and _device_steps(settings) >= WORTH_WORKERS
     else:
         count, several = where.workers, where.workers > 0
     if where.cluster is not None:
         with open_cluster(where.cluster, count or cores()) as (executor, _):
-            yield cluster_runner(executor, settings, subject.path)
+            yield cluster_runner(executor, settings, model)
     elif several:
-        with open_workers(settings, subject.path, count) as workers:
+        with open_workers(settings, model, count) as workers:
             yield workers
     else:
         yield single_thread(Simulator(settings, subject.model))

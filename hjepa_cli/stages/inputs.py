@@ -21,7 +21,7 @@ from hjepa_cli.core.memory import keep_freed_memory
 from hjepa_cli.core.model import encode_frames
 from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.core.ranks import ALONE, Ranks
-from hjepa_cli.core.system import System
+from hjepa_cli.core.system import System, same_camera
 from hjepa_cli.core.training import resolve_device
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.screen import Screen
@@ -147,17 +147,23 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
 
     Raises:
         MissingInputError: there is none.
-        DataError: it belongs to another plant.
+        DataError: it belongs to another plant, or was collected with another camera.
         UsageError: the settings do not fit their plant.
     """
-    plant_of(settings)
+    kind = plant_of(settings)
     path = path or find_newest_dataset(Path("data"), settings.plant)
     if path is None:
         raise MissingInputError(
             f"no dataset of plant {settings.plant} below data/",
             hint=f"hjepa collect --plant {settings.plant}, or pass --dataset DIR",
         )
-    return load_dataset(path, settings.plant)
+    data = load_dataset(path, settings.plant)
+    if not same_camera(data.camera, kind):
+        raise DataError(
+            f"dataset {path} was collected with another camera than plant {kind.name} has now",
+            hint=f"hjepa collect --plant {kind.name}",
+        )
+    return data
 
 
 def render(

@@ -16,10 +16,11 @@ from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
+from hjepa_cli.stages.inputs import open_dataset
 from hjepa_cli.storage import runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 from hjepa_cli.storage.curves import Digest
-from hjepa_cli.storage.datasets import Dataset, load_dataset
+from hjepa_cli.storage.datasets import Dataset
 from hjepa_cli.storage.zoo import CURVES_FILE
 
 TRAINING = ("train-encoder", "train-hierarchy")
@@ -172,7 +173,7 @@ def open_subject(
             f"model {path} drives plant {model.plant_name}, not {settings.plant}",
             hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
         )
-    data = load_dataset(dataset, settings.plant) if dataset else None
+    data = open_dataset(dataset, settings) if dataset else None
     held = (*(model.methods if model else ()), *TRUE_STATE)
     lacking = [name for name in settings.methods if name not in held]
     if further is None:

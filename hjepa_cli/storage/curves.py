@@ -16,6 +16,7 @@ from typing import Any
 from hjepa_cli.checks import ANCHORS
 from hjepa_cli.core.conditions import altered
 from hjepa_cli.core.loop import LOOP_VERSION
+from hjepa_cli.core.plant import definition
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.settings import Settings
 from hjepa_cli.storage import files
@@ -29,14 +30,8 @@ Entry = dict[str, Any]
 Check = Callable[[Any], bool]
 
 LARGEST = 1e12  # beyond anything that is measured; keeps arithmetic in range
-CLEAN = (  # settings of ``collect`` that clean rollouts depend on
-    "clean_trajectories",
-    "clean_steps",
-    "x_m",
-    "x_dot_m_s",
-    "theta_rad",
-    "theta_dot_rad_s",
-)
+RANGES = ("x_m", "x_dot_m_s", "theta_rad", "theta_dot_rad_s")  # of starts, in ``collect``
+CLEAN = ("clean_trajectories", "clean_steps", *RANGES)  # what clean rollouts depend on
 FITTED = ("trajectories", "test_trajectories", "steps", "exploration_n", "exploration_hold_steps")
 
 
@@ -81,6 +76,7 @@ class Digest:
             collected = source["collect"]
             clean = [source["seed"], *(collected[key] for key in CLEAN)]
             clean += collected.get("start", [])
+            starts = _starts(collected)
             conditions = altered(values)
             if (theirs := altered(source)) != conditions:
                 clean.append(theirs)
@@ -96,9 +92,13 @@ class Digest:
             "embedding": values["encoder"]["embedding"],
             "clean": clean,
         }
+        if system := definition(values["plant"]):
+            measured["system"] = system
         if conditions:  # or digests would not be those of before there were conditions
             measured["conditions"] = conditions
         fitted = [values["collect"][key] for key in FITTED]
+        if _starts(values["collect"]) != starts:  # the dataset's are in ``clean``, these nowhere
+            fitted.append(_starts(values["collect"]))
         if values["protocol"]["payload"].startswith("pca"):  # components are fitted to them, too
             measured["fitted"] = fitted
         return cls(checkpoint, _sha256(measured), _sha256(fitted))
@@ -106,6 +106,10 @@ class Digest:
     def as_dict(self) -> dict[str, Any]:
         """As it stands in a file, for all of its methods."""
         return {name: value for name, value in vars(self).items() if name != "fitted"}
+
+
+def _starts(collected: Mapping[str, Any]) -> list[Any]:
+    return [*(collected[key] for key in RANGES), *collected.get("start", [])]
 
 
 def read(path: Path, digest: Digest) -> dict[str, Entry]:
