@@ -409,9 +409,9 @@ def test_a_plant_of_ones_own_is_measured_again_when_it_has_changed(
     monkeypatch.setattr(plant_module.systems, "source_sha256", lambda name: f"{name}, heavier")
     assert curves.Digest.of("model", settings) != before
 
-    digests, settings = set(), dataclasses.replace(small(), plant="mine")
+    digests, settings, desktop = set(), dataclasses.replace(small(), plant="mine"), plant("desktop")
     for mass_kg in (0.1, 0.2):
-        mine = dataclasses.replace(plant("desktop"), name="mine", pole_mass_kg=mass_kg)
+        mine = dataclasses.replace(desktop, name="mine", pole_mass_kg=mass_kg)
         monkeypatch.setattr(plant_module, "PLANTS", {"mine": mine})
         digests.add(curves.Digest.of("model", settings))
     assert len(digests) == 2
