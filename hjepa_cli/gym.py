@@ -20,6 +20,7 @@ except ModuleNotFoundError as missing:
     ) from None
 from gymnasium import spaces
 
+from hjepa_cli.checks import check_count
 from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
 from hjepa_cli.core.loop import STATE_LIMIT, noise_per_step
 from hjepa_cli.core.metrics import COST_CAP
@@ -48,7 +49,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: ``"rgb_array"`` or ``None``.
 
     Raises:
-        UsageError: unknown plant or reward, or no step at all.
+        UsageError: unknown plant or reward, or steps that are not a count.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
@@ -64,8 +65,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> None:
         if reward not in REWARDS:
             raise UsageError(f"unknown reward '{reward}'; choose one of {', '.join(REWARDS)}")
-        if action_repeat < 1:
-            raise UsageError(f"action_repeat = {action_repeat}; expected at least 1")
+        check_count("action_repeat", action_repeat)
         self._pole = CartPole(plant)
         self._kind = self._pole.plant
         self._protocol = load_settings("gym" if plant == "gym" else None).protocol

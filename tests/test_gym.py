@@ -119,7 +119,12 @@ def test_equal_seeds_give_equal_episodes():
 
 
 def test_wrong_options_are_refused():
-    for options in ({"reward": "win"}, {"plant": "cart"}, {"action_repeat": 0}):
+    for options in (
+        {"reward": "win"},
+        {"plant": "cart"},
+        {"action_repeat": 0},
+        {"action_repeat": 2.5},
+    ):
         with pytest.raises(UsageError):
             hjepa_cli.gym.CartPoleEnv(**options)
     with pytest.raises(UsageError):

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from pathlib import Path
 
 import pytest
 from command_line import assert_one_line_error, open_shell
@@ -153,6 +154,15 @@ def test_a_slot_too_small_for_a_packet_is_said(stage):
 def test_what_cannot_be_scheduled(stage):
     with pytest.raises(MissingInputError, match="nothing to schedule"):
         stage("optimal")
+    with pytest.raises(UsageError, match="supervised-2 needs several slots"):
+        stage("hold-true", "supervised-2")
+
+
+def test_one_step_is_refused_before_anything_is_written(stage, monkeypatch):
+    monkeypatch.setitem(SMALL, "protocol.steps", 1)
+    with pytest.raises(UsageError, match="steps = 1; law scheduled needs at least 2"):
+        stage("hold-true")
+    assert not Path("runs").exists()
 
 
 def test_verify_simulates_both_sides_of_each_load(stage, monkeypatch):
