@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hjepa_cli.checks import check_count, check_schedulable
 from hjepa_cli.command import resolve
 from hjepa_cli.core import cell_loop
 from hjepa_cli.core.conditions import actual_plant
@@ -77,8 +78,7 @@ def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tu
     Raises:
         UsageError: no such predictor, or no step.
     """
-    if steps < 1:
-        raise UsageError(f"steps = {steps}; expected at least 1")
+    check_count("steps", steps)
     planner = model.planner(method)
     z = z.to(model.device)
     forces_n = []
@@ -101,8 +101,9 @@ def drive(
     """Drive some devices in closed loop over one link and return what happened.
 
     Args:
-        method: as on the command line; those on embeddings need ``model``.
-        model: of :func:`load_model`.
+        method: as on the command line; those on embeddings need ``model``. Packets of ``hold+9``
+            come 9 steps late, and the controller takes them for fresh.
+        model: of :func:`load_model`, of the same plant.
         gap_steps: a packet every so many steps; or
         delivery: a packet at every step that arrives with this probability. Neither: all arrive.
         devices: n.
@@ -113,8 +114,10 @@ def drive(
         band), ``cost`` [n] (mean capped quadratic cost).
 
     Raises:
-        UsageError: unknown method, or both kinds of link.
+        UsageError: unknown method, both kinds of link, or no device.
+        DataError: ``model`` is of another plant.
     """
+    check_count("devices", devices)
     if gap_steps is not None and delivery is not None:
         raise UsageError("give gap_steps or delivery, not both")
     chosen = _settings(preset, None, settings)
@@ -161,11 +164,11 @@ def simulate_cell(
     """Drive devices that compete for one uplink, as ``hjepa scale --law scheduled`` does.
 
     Args:
-        method: as on the command line; those on embeddings need ``model``.
+        method: one that sends packets of a slot; those on embeddings need ``model``.
         devices: N, how many compete.
         blocks: J resource blocks in every slot, each as long as a packet.
         scheduler: who gets them.
-        model: of :func:`load_model`.
+        model: of :func:`load_model`, of the same plant.
         preset, settings: plant, seed and protocol (its steps K); of ``radio``, the power margin,
             how long fades last and the share of transmissions that fail, none of which is repeated.
 
@@ -174,9 +177,14 @@ def simulate_cell(
         ``packets`` [N] that arrived, ``reports`` of all devices to a scheduler that asks for them.
 
     Raises:
-        UsageError: unknown method or scheduler, or more blocks than devices.
+        UsageError: unknown method or scheduler, a method without packets of a slot, more blocks
+            than devices, or fewer than two steps.
+        DataError: ``model`` is of another plant.
     """
+    check_count("devices", devices)
+    check_count("blocks", blocks)
     chosen = _settings(preset, None, settings)
+    check_schedulable([method], chosen.protocol.steps)
     kind, protocol, radio = actual_plant(chosen), chosen.protocol, chosen.radio
     how = build_method(method, chosen, model)
     access = Access(

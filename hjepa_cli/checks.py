@@ -5,7 +5,8 @@ it is and what it may be, whether it came from a flag or a file.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 from hjepa_cli.errors import UsageError
@@ -168,14 +169,55 @@ def check_flags_of_law(law: str, given: Mapping[str, bool]) -> None:
             )
 
 
+def check_schedulable(methods: Sequence[str], steps: int) -> None:
+    """Check that methods can compete for the slots of one uplink, and that there are slots to win.
+
+    Raises:
+        UsageError: packets that take several slots, come late or need no link, or fewer than two
+            steps.
+    """
+    if raw := [name for name in methods if split_late(name)[0] in RAW_FRAMES]:
+        raise UsageError(
+            f"law scheduled fits packets into slots; {', '.join(raw)} needs several slots for one",
+            hint="choose --law duty for it, or other --methods",
+        )
+    for name in methods:
+        method, delay_steps = split_late(name)
+        if method in LINKLESS:
+            raise UsageError(f"'{name}' has no link to share; choose a method that has one")
+        if delay_steps:
+            raise UsageError(f"'{name}': under law scheduled packets arrive in the slot they get")
+    if steps < 2:
+        raise UsageError(
+            f"protocol.steps = {steps}; law scheduled needs at least 2, as in the first slot "
+            "everybody is heard"
+        )
+
+
+def check_count(name: str, value: object) -> None:
+    """Check what is given from Python as a number of something.
+
+    Raises:
+        UsageError: not a whole number of at least 1.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+        raise UsageError(f"{name} = {value}; expected a whole number, at least 1")
+
+
 def late(method: str, steps: int) -> str:
     """A method whose packets arrive ``steps`` steps after they were sent: ``supervised-2+3``."""
     return f"{method}{LATE}{steps}" if steps else method
 
 
 def split_late(name: str) -> tuple[str, int]:
-    """The method behind :func:`late`, and the steps."""
-    method, _, steps = name.partition(LATE)
+    """The method behind :func:`late`, and the steps.
+
+    Raises:
+        UsageError: what follows the sign is no number of steps.
+    """
+    method, sign, steps = name.partition(LATE)
+    if sign and not re.fullmatch(r"[0-9]{1,18}", steps):
+        raise UsageError(f"method '{name}'; expected whole steps after the {LATE}: {method}{LATE}3")
     return method, int(steps or 0)
 
 

@@ -20,12 +20,13 @@ except ModuleNotFoundError as missing:
     ) from None
 from gymnasium import spaces
 
+from hjepa_cli.checks import check_count
 from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
 from hjepa_cli.core.loop import STATE_LIMIT, noise_per_step
 from hjepa_cli.core.metrics import COST_CAP
 from hjepa_cli.core.plant import CartPole
 from hjepa_cli.core.seeding import generator
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.settings import load_settings
 
 Observation = NDArray[Any]
@@ -48,7 +49,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: ``"rgb_array"`` or ``None``.
 
     Raises:
-        UsageError: unknown plant or reward, or no step at all.
+        UsageError: unknown plant or reward, or steps that are not a count.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
@@ -64,8 +65,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> None:
         if reward not in REWARDS:
             raise UsageError(f"unknown reward '{reward}'; choose one of {', '.join(REWARDS)}")
-        if action_repeat < 1:
-            raise UsageError(f"action_repeat = {action_repeat}; expected at least 1")
+        check_count("action_repeat", action_repeat)
         self._pole = CartPole(plant)
         self._kind = self._pole.plant
         self._protocol = load_settings("gym" if plant == "gym" else None).protocol
@@ -85,22 +85,30 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start anywhere in the protocol's range of initial states."""
+        """Start as the closed loop does: anywhere in its range, then one step without a force."""
         super().reset(seed=seed)
         protocol = self._protocol
         half_widths = np.array(protocol.half_widths)
         # A new simulation: what pymunk remembers of the last episode would move the last bits.
         self._pole = CartPole(self._kind)
         self._pole.state = self.np_random.uniform(-1, 1, 4) * half_widths
+        self._pole.step(0.0)  # from k = -1 to 0, which nobody scores
         self._k = 0
         return self._observe(), self._info(float(self._kind.in_band(self._pole.state)))
 
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Apply a force, ``action_repeat`` control steps long."""
+        """Apply a force, ``action_repeat`` control steps long.
+
+        Raises:
+            NumericalError: the action is not finite.
+        """
         kind, limit_n = self._kind, self._kind.force_limit_n
-        force_n = float(np.clip(np.asarray(action, float).reshape(-1)[0], -1, 1)) * limit_n
+        share = float(np.asarray(action, float).reshape(-1)[0])
+        if not math.isfinite(share):
+            raise NumericalError(f"the action is not finite at step {self._k}: {share}")
+        force_n = min(max(share, -1.0), 1.0) * limit_n
         score = cost = 0.0
         steps = min(self._repeat, self._protocol.steps - self._k) or 1
         for _ in range(steps):
@@ -136,7 +144,8 @@ class CartPolePixelsEnv(CartPoleEnv):
     """The same cart-pole seen by the camera: frames uint8 [64, 128, 3].
 
     One frame shows no velocity. ``gymnasium.wrappers.FrameStackObservation(env, 2)`` gives pairs
-    uint8 [2, 64, 128, 3] (previous, current), which is what a model's encoder takes.
+    uint8 [2, 64, 128, 3] (previous, current), which is what a model's encoder takes. The pair of
+    ``reset`` is its one frame twice, as wrappers have no other: a pole at rest to an encoder.
 
     Args:
         **options: those of :class:`CartPoleEnv`.

@@ -15,7 +15,7 @@ import hjepa_cli
 from hjepa_cli.core.codecs import Integers
 from hjepa_cli.core.loop import play
 from hjepa_cli.core.methods import embedding_method
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import DataError, UsageError
 
 QUICK = {"protocol.steps": 40, "protocol.curve_devices": 4, "protocol.bracket_devices": 8}
 
@@ -70,7 +70,7 @@ def test_predict_plays_what_the_controller_plays(model):
     part, z_part = hjepa_cli.predict(model, z, 4)
     torch.testing.assert_close(hjepa_cli.predict(model, z_part, 4)[1], z_whole)
     torch.testing.assert_close(whole[:, :4], part)
-    for wrong in ({"steps": 0}, {"steps": 5, "method": "oracle"}):
+    for wrong in ({"steps": 0}, {"steps": 2.5}, {"steps": 5, "method": "oracle"}):
         with pytest.raises(UsageError):
             hjepa_cli.predict(model, z, **wrong)
 
@@ -112,6 +112,75 @@ def test_a_simulated_cell_is_the_stage_s():
     for wrong in ({"scheduler": "luck"}, {"blocks": 11}):
         with pytest.raises(UsageError):
             hjepa_cli.simulate_cell("hold-true", devices=10, settings=QUICK, **wrong)
+
+
+def test_a_model_of_another_plant_is_refused(tmp_path):
+    gym = hjepa_cli.load_model(untrained(tmp_path / "gym.safetensors", plant_name="gym"))
+    for call in (hjepa_cli.drive, hjepa_cli.simulate_cell):
+        for method in ("hjepa", "oracle"):
+            with pytest.raises(DataError, match="drives plant gym, not desktop") as caught:
+                call(method, model=gym, devices=2, settings=QUICK)
+        assert '{"plant": "gym"}' in caught.value.hint
+        assert len(call("hold", model=gym, devices=2, settings=QUICK | {"plant": "gym"})["score"])
+
+
+@pytest.mark.parametrize(
+    ("method", "says"),
+    [
+        ("optimal", "no link"),
+        ("local", "no link"),
+        ("hold-true+9", "arrive in the slot"),
+        ("supervised-2", "needs several slots"),
+        ("supervised-2+3", "needs several slots"),
+    ],
+)
+def test_a_simulated_cell_refuses_what_the_stage_does_not_schedule(model, method, says):
+    with pytest.raises(UsageError, match=says):
+        hjepa_cli.simulate_cell(method, model=model, devices=4, settings=QUICK)
+
+
+def test_a_simulated_cell_needs_two_slots():
+    with pytest.raises(UsageError, match="steps = 1; law scheduled needs at least 2"):
+        hjepa_cli.simulate_cell("hold-true", devices=4, settings={"protocol.steps": 1})
+    two = hjepa_cli.simulate_cell("hold-true", devices=4, settings={"protocol.steps": 2})
+    assert two["packets"].sum() <= 1
+
+
+@pytest.mark.parametrize(
+    ("call", "method", "options"),
+    [
+        (hjepa_cli.drive, "oracle", {"gap_steps": np.inf}),
+        (hjepa_cli.drive, "oracle", {"gap_steps": np.nan}),
+        (hjepa_cli.drive, "oracle", {"delivery": np.nan}),
+        (hjepa_cli.drive, "oracle", {"devices": -1}),
+        (hjepa_cli.drive, "oracle", {"devices": 0}),
+        (hjepa_cli.drive, "oracle", {"devices": 2.5}),
+        (hjepa_cli.drive, "oracle", {"devices": True}),
+        (hjepa_cli.drive, "oracle+x", {}),
+        (hjepa_cli.drive, "oracle+", {}),
+        (hjepa_cli.drive, "oracle+-3", {}),
+        (hjepa_cli.simulate_cell, "oracle", {"devices": -1}),
+        (hjepa_cli.simulate_cell, "oracle", {"devices": 4, "blocks": 1.5}),
+    ],
+)
+def test_bad_values_are_one_clear_line(call, method, options):
+    with pytest.raises(UsageError) as caught:
+        call(method, settings=QUICK, **options)
+    wrong = [*map(str, options.values()), *([method] if "+" in method else [])]
+    assert any(value in caught.value.message for value in wrong)
+    assert "\n" not in caught.value.message
+
+
+def test_late_packets_are_taken_for_fresh(model):
+    """With a packet at every step a predictor plays what its actor does, late as on time."""
+    late, held = (
+        hjepa_cli.drive(f"{name}+3", model=model, devices=2, settings=QUICK)["forces_n"]
+        for name in ("hjepa", "hold")
+    )
+    assert (late[:3] == 0).all() and (late[3] != 0).all()
+    np.testing.assert_allclose(late, held, rtol=1e-4, atol=1e-4)
+    never = hjepa_cli.drive("hold-true+99999999999", devices=2, settings=QUICK)
+    assert (never["forces_n"] == 0).all()
 
 
 def test_stages_return_their_documents_and_print_nothing(capsys):

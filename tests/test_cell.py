@@ -91,6 +91,7 @@ def test_a_method_without_a_link_has_no_count():
 def test_a_method_that_fails_with_every_packet_supports_nobody(law, changes):
     found = row(law, entry(**changes))
     assert found["devices"] == 0 and "even with a packet in every slot" in found["reason"]
+    assert found["bits_per_s"] is found["ratio_to_limit"] is None
 
 
 def test_a_crowded_cell_says_why():
@@ -99,6 +100,14 @@ def test_a_crowded_cell_says_why():
     assert narrow["reason"] == "a packet takes 11.5 slots and serves for 2"
     narrow = row("equal", entry(p=0.9), snr_db=0.0, bandwidth_hz=180e3)
     assert narrow["devices"] == 0 and "one device alone delivers with p = " in narrow["reason"]
+    assert narrow["bits_per_s"] is narrow["ratio_to_limit"] is None
+
+
+def test_a_range_that_ends_at_every_packet_is_no_failure():
+    """``protocol.gaps = [1]`` and an acceptable score: p* ≤ 1, and nobody looked further."""
+    found = row("equal", entry(p=1.0, censored=True))
+    assert found["devices"] == 0 and found["at_least"]
+    assert found["reason"] == "one device alone delivers with p = 0.999; measured down to 1 only"
 
 
 def test_a_raw_frame_pays_for_being_late():

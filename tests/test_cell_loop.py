@@ -294,7 +294,7 @@ def curve(crossing, calls, level=0.62, spread=0.01):
         calls.append(load)
         score = np.full(40, level + 0.004 * (crossing - load))
         score += np.linspace(-spread, spread, 40)
-        outcome = CellOutcome(score, score, np.full(40, 25), 100, 1000)
+        outcome = CellOutcome(score, score, np.full(40, 25), 100, 1001)  # 1,000 that count
         return LoadPoint(load, 1, outcome, np.ones(40))
 
     return simulate_load

@@ -38,7 +38,7 @@ from hjepa_cli.core.workers import ModelFile, open_workers, simulate, single_thr
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
-from hjepa_cli.stages import evaluate
+from hjepa_cli.stages import evaluate, scale
 from hjepa_cli.stages.train_encoder import describe_architecture
 from hjepa_cli.storage import curves, zoo
 from hjepa_cli.storage.checkpoints import save_checkpoint
@@ -345,6 +345,20 @@ def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:
     assert measured == entry["gap_bracket"] + entry["delivery_bracket"]
     with pytest.raises(UsageError, match="no model for method 'ts-jepa-5'"):
         evaluate.measure_points(subject, Output().screen, method="ts-jepa-5", gaps=[1])
+
+
+@pytest.mark.parametrize("law", ["eval", "duty", "scheduled"])
+def test_a_teacher_that_never_is_in_the_band_is_an_error_not_an_acceptable_score(law: str) -> None:
+    settings = small(methods=("hold-true",), x_m=3.0, theta_rad=3.0)
+    with pytest.raises(NumericalError, match="the teacher itself is never inside the band"):
+        if law == "eval":
+            evaluate.run(settings, Output().screen)
+        else:
+            settings = dataclasses.replace(
+                settings, radio=dataclasses.replace(settings.radio, law=law)
+            )
+            scale.run(settings, Output().screen)
+    assert not list(Path("runs").rglob("curves.json"))
 
 
 # --- The cache ----------------------------------------------------------------------------------

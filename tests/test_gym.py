@@ -12,9 +12,10 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402 - needs gymnasiu
 
 import hjepa_cli.gym  # noqa: E402 - needs gymnasium
 from hjepa_cli.core.camera import Camera  # noqa: E402
+from hjepa_cli.core.loop import World  # noqa: E402
 from hjepa_cli.core.plant import CartPole, plant  # noqa: E402
 from hjepa_cli.core.policy import teacher  # noqa: E402
-from hjepa_cli.errors import UsageError  # noqa: E402
+from hjepa_cli.errors import NumericalError, UsageError  # noqa: E402
 from hjepa_cli.settings import load_settings  # noqa: E402
 
 IDS = ("hjepa/CartPole-v0", "hjepa/CartPolePixels-v0")
@@ -42,6 +43,28 @@ def test_a_step_is_the_plants_and_the_reward_is_the_cost():
         np.testing.assert_allclose(info["state"], state, atol=1e-9)
         np.testing.assert_allclose(observation, state, atol=1e-6)
         assert not terminated and not truncated
+
+
+@pytest.mark.parametrize("kind", ["desktop", "gym"])
+def test_an_episode_starts_where_the_closed_loop_does(kind):
+    env = gymnasium.make(IDS[0], plant=kind).unwrapped
+    observation, info = env.reset(seed=3)
+    protocol = load_settings("gym" if kind == "gym" else None).protocol
+    random, _ = gymnasium.utils.seeding.np_random(3)
+    initial = random.uniform(-1, 1, (1, 4)) * protocol.half_widths
+    world = World(plant(kind), initial, np.ones((1, 2)), iter(()))
+    np.testing.assert_array_equal(info["state"], world.states[0])
+    assert (info["state"] != initial[0]).any()
+    np.testing.assert_allclose(observation, world.states[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("share", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite_is_an_error_and_moves_nothing(share):
+    env = gymnasium.make(IDS[0]).unwrapped
+    _, before = env.reset(seed=0)
+    with pytest.raises(NumericalError, match="the action is not finite at step 0"):
+        env.step(np.array([share], np.float32))
+    np.testing.assert_array_equal(env._pole.state, before["state"])
 
 
 def test_a_repeated_action_is_held_and_its_reward_averaged():
@@ -119,7 +142,12 @@ def test_equal_seeds_give_equal_episodes():
 
 
 def test_wrong_options_are_refused():
-    for options in ({"reward": "win"}, {"plant": "cart"}, {"action_repeat": 0}):
+    for options in (
+        {"reward": "win"},
+        {"plant": "cart"},
+        {"action_repeat": 0},
+        {"action_repeat": 2.5},
+    ):
         with pytest.raises(UsageError):
             hjepa_cli.gym.CartPoleEnv(**options)
     with pytest.raises(UsageError):

@@ -90,8 +90,8 @@ def test_the_first_packet_always_arrives(gap: float) -> None:
     assert delivery_schedule(1 / gap, np.random.default_rng(0).random((20, 50)))[0].all()
 
 
-@pytest.mark.parametrize("gap", [0.5, 0.0, -1.0, math.nan])
-def test_gaps_below_one_step_are_refused(gap: float) -> None:
+@pytest.mark.parametrize("gap", [0.5, 0.0, -1.0, math.nan, math.inf])
+def test_gaps_below_one_step_and_without_end_are_refused(gap: float) -> None:
     with pytest.raises(UsageError, match="1 step or longer"):
         gap_schedule(gap, 10, 2)
 

@@ -18,6 +18,7 @@ from hjepa_cli.core.metrics import (
     window_means,
 )
 from hjepa_cli.core.plant import plant
+from hjepa_cli.errors import NumericalError
 
 
 def test_score_band_includes_its_edges_and_ignores_velocities() -> None:
@@ -95,7 +96,20 @@ def test_ratio_has_one_value_per_point_and_replicate() -> None:
         for p in range(3):
             expected = (weights[b] * values[p]).sum() / (weights[b] * reference).sum()
             assert replicates[b, p] == pytest.approx(expected)
-    assert np.isnan(ratio(values, np.zeros(4))).all() or np.isinf(ratio(values, np.zeros(4))).any()
+
+
+def test_a_reference_of_zero_normalises_nothing() -> None:
+    values, nothing = np.arange(12.0).reshape(3, 4), np.zeros(4)
+    for weights in (None, bootstrap_weights(4, 5, seed=0)):
+        with pytest.raises(NumericalError, match="never inside the band with any of 4 devices"):
+            ratio(values, nothing, weights)
+    # One device counts: the replicates that did not draw it are undefined and left out.
+    one, weights = np.array([0.5, 0, 0, 0]), bootstrap_weights(4, 400, seed=0)
+    replicates = ratio(values, one, weights)
+    undefined = weights[:, 0] == 0
+    assert 0.2 < undefined.mean() < 0.45  # (3/4)^4 = 0.32
+    assert (np.isnan(replicates) == undefined[:, None]).all()
+    assert (interval(replicates) == interval(replicates[~undefined])).all()
 
 
 def test_interval_is_the_percentile_interval_and_keeps_infinities() -> None:
@@ -123,6 +137,14 @@ def test_crossing_of_known_curves() -> None:
     assert log[0] == pytest.approx(2 * 2 ** (0.28 / 0.4))  # 2^(1 + share): linear in ln gap
     assert log[1:3].tolist() == [-np.inf, np.inf]
     assert first_crossing(gaps, curves[0], 0.62, log=False).shape == ()
+
+
+def test_an_undefined_score_is_not_acceptable() -> None:
+    gaps, undefined = np.array([1.0, 2.0, 4.0]), np.nan
+    curves = np.array([[undefined] * 3, [1.0, 0.9, undefined], [1.0, undefined, 0.9]])
+    for log in (False, True):
+        crossing = first_crossing(gaps, curves, 0.62, log=log)
+        assert crossing == pytest.approx([-np.inf, 2.0, 1.0])
 
 
 @given(

@@ -118,6 +118,7 @@ def test_dry_run_plans_all_stages_and_writes_nothing(shell, preset):
         ([], "[protocol]\nhorizon = 120", ["horizon = 120"]),
         ([], '[radio]\nsnr_db = "30:10"', ["--snr"]),
         (["--methods", "optimal,local"], '[radio]\nlaw = "scheduled"', ["nothing to schedule"]),
+        ([], '[radio]\nlaw = "scheduled"\n[protocol]\nsteps = 1', ["protocol.steps = 1"]),
     ],
 )
 @pytest.mark.parametrize("how", [[], ["--dry-run"]], ids=str)

@@ -31,6 +31,9 @@ class Bench:
 
     Attributes:
         reference: the teacher, on the true state at every step, with all devices.
+
+    Raises:
+        NumericalError: the teacher never is inside the band.
     """
 
     def __init__(
@@ -48,6 +51,8 @@ class Bench:
         few = protocol.curve_devices
         self._every_step["state"] = Outcome(teacher.score[:, :few], teacher.cost[:, :few])
         self.reference = Reference(teacher.score[0], teacher.cost[0], protocol.bootstrap, seed)
+        # Now, not after the curves of the first method: every normalised score divides by it.
+        metrics.reference_mean(self.reference.score[: min(few, protocol.bracket_devices)])
 
     @property
     def teacher_score(self) -> float:

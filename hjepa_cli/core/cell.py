@@ -81,7 +81,7 @@ class Cell:
     limit_bits_per_s: float
 
     def row(self, need: Need, snr_db: float) -> Row:
-        """Count one method's devices at one SNR.
+        """Count one method's devices at one SNR; where there are none, the reason.
 
         A block is what one packet takes at γ̄; ``load_per_block`` is devices ÷ blocks of a slot.
         """
@@ -109,12 +109,12 @@ class Cell:
         row["devices_ci95"] = [self._devices(need, end, snr_db) for end in ends]
         link = (need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
         row["load_per_block"] = row["devices"] / float(slot_capacity(*link))
-        if packets_per_slot := self._packets_per_slot(need, snr_db):
-            row["bits_per_s"] = need.payload_bits * packets_per_slot / self.slot_s
-            if self.limit_bits_per_s > 0:
-                row["ratio_to_limit"] = row["bits_per_s"] / self.limit_bits_per_s
         if row["devices"] == 0:
-            row["reason"] = self._why_nobody(need.tolerance, need.payload_bits, snr_db)
+            return row | {"reason": self._why_nobody(need, snr_db)}
+        packets_per_slot = self._packets_per_slot(need, snr_db)
+        row["bits_per_s"] = need.payload_bits * packets_per_slot / self.slot_s
+        if self.limit_bits_per_s > 0:
+            row["ratio_to_limit"] = row["bits_per_s"] / self.limit_bits_per_s
         return row
 
     def _devices(self, need: Need, tolerance: float, snr_db: float) -> int:
@@ -133,22 +133,28 @@ class Cell:
         return max(tolerance - float(late_slots(c)), 0.0)
 
     def _packets_per_slot(self, need: Need, snr_db: float) -> float:
-        """That reach the controller of a loop at its tolerance; 0 where no rate is enough."""
+        """That reach the controller of a loop at its tolerance, where the cell has some."""
         assert need.tolerance is not None and need.payload_bits is not None
         if self.law == "equal":
             return need.tolerance
         c = slot_capacity(need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
-        period = self._period_slots(need, need.tolerance, float(c))
-        return 1 / period if period else 0.0
+        return 1 / self._period_slots(need, need.tolerance, float(c))
 
-    def _why_nobody(self, tolerance: float, payload_bits: int, snr_db: float) -> str:
-        if tolerance == (0.0 if self.law == "duty" else 1.0):
+    def _why_nobody(self, need: Need, snr_db: float) -> str:
+        assert need.tolerance is not None and need.payload_bits is not None
+        tolerance = need.tolerance
+        # p* = 1 is also where the measured range of a method ends that was measured nowhere else.
+        if tolerance == (0.0 if self.law == "duty" else 1.0) and not need.at_least:
             return "below the acceptable score even with a packet in every slot"
-        link = (payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
+        link = (need.payload_bits, self.bandwidth_hz, self.slot_s, snr_db)
         if self.law == "duty":
             slots = 1 / float(slot_capacity(*link))
             return f"a packet takes {slots:.3g} slots and serves for {tolerance:.3g}"
         p = float(equal_delivery_probability(1, *link, noise=self.noise))
+        if need.at_least:
+            return (
+                f"one device alone delivers with p = {p:.3g}; measured down to {tolerance:.3g} only"
+            )
         return f"one device alone delivers with p = {p:.3g}, but needs {tolerance:.3g}"
 
 

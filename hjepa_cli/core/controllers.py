@@ -49,8 +49,10 @@ class StrideController:
     def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
         """Forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
 
-        The first call must deliver to every device.
+        The first packets must be of every device; until they come, no force is played.
         """
+        if packets is None and not self._anchors.shape[1]:
+            return np.zeros((len(delivered), *self._forces_n.shape[2:]))
         if packets is not None:
             if not self._anchors.shape[1]:
                 self._anchors = packets.new_zeros(len(delivered), packets.shape[1])

@@ -12,6 +12,7 @@ Devices N and curve points P (different link schedules on the same draws) share 
 """
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
@@ -137,16 +138,16 @@ def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
     """One packet every D steps: device i sends at 0 and at ⌈nD + φ_i⌉, φ_i = i mod D, n = 0, 1, …
 
     Args:
-        gap_steps: D ≥ 1, whole or fractional.
+        gap_steps: D ≥ 1, whole or fractional, finite.
 
     Returns:
         bool [steps, devices].
 
     Raises:
-        UsageError: D < 1.
+        UsageError: D < 1, or infinite.
     """
-    if not gap_steps >= 1:
-        raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer")
+    if not 1 <= gap_steps < math.inf:
+        raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer, and finite")
     phases = np.fmod(np.arange(devices), gap_steps)
     periods = np.arange(int(steps / gap_steps) + 1)
     # 1e-9 keeps a sum that is whole up to rounding from being sent one step late.
@@ -225,7 +226,7 @@ def simulate(
     noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
     world = World(plant, initial, mass_scale, noise)
     nothing = np.zeros(points * devices, dtype=bool), None
-    under_way = deque([nothing] * delay_steps)
+    under_way = deque([nothing] * min(delay_steps, steps))
     for k in range(steps):
         states, sent = world.states, delivered[:, k].reshape(-1)
         under_way.append((sent, world.sense(sensor, sent)))

@@ -27,7 +27,7 @@ from hjepa_cli.core.loop import Controller, Sensor
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.sensors import camera_sensor, embedding_sensor, true_state
 from hjepa_cli.core.system import Camera, System
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.settings import Settings
 
 if TYPE_CHECKING:
@@ -67,9 +67,15 @@ def build_method(name: str, settings: Settings, model: "Model | None") -> Method
     """Any method by its name, on time or :func:`~hjepa_cli.checks.late`, as the settings want it.
 
     Raises:
-        UsageError: there is no model that holds it.
+        UsageError: there is no model that holds it, or a lateness that is no number.
+        DataError: the model is of another plant.
     """
     name, steps = split_late(name)
+    if model and model.plant_name != settings.plant:
+        raise DataError(
+            f"the model drives plant {model.plant_name}, not {settings.plant}",
+            hint=f'add settings={{"plant": "{model.plant_name}"}}, or pass another model',
+        )
     method = _build_method(name, settings, model)
     return dataclasses.replace(
         method, name=late(name, steps), family=late(method.family, steps), delay_steps=steps

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hjepa_cli.core.seeding import generator
+from hjepa_cli.errors import NumericalError
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +58,11 @@ def interval(replicates: Floats) -> Floats:
     """95 % percentile interval over the first axis: [B, ...] → [2, ...].
 
     Takes order statistics as they are, so that infinite replicates (no crossing) stay infinite.
+    Undefined replicates (see :func:`ratio`) are left out.
     """
+    undefined = np.isnan(replicates)
+    if undefined.any():
+        return np.nanquantile(replicates, TAILS, axis=0, method="inverted_cdf")
     return np.quantile(replicates, TAILS, axis=0, method="inverted_cdf")
 
 
@@ -82,13 +87,33 @@ def ratio(values: Floats, reference: Floats, weights: Floats | None = None) -> F
         weights: bootstrap weights [B, N]; ``None`` is the plain mean.
 
     Returns:
-        [...], or [B, ...] with weights; NaN where the reference is 0.
+        [...], or [B, ...] with weights; there NaN in replicates that drew a reference of 0.
+
+    Raises:
+        NumericalError: the reference is 0.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if weights is None:
-            return np.asarray(values.mean(axis=-1) / reference.mean())
-        reference_means = (weights @ reference).reshape(-1, *[1] * (values.ndim - 1))
-        return np.asarray(np.moveaxis(values @ weights.T, -1, 0) / reference_means)
+    mean = reference_mean(reference)
+    if weights is None:
+        return np.asarray(values.mean(axis=-1) / mean)
+    means = weights @ reference
+    means = np.where(means == 0, np.nan, means).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(np.moveaxis(values @ weights.T, -1, 0) / means)
+
+
+def reference_mean(reference: Floats) -> float:
+    """The mean that scores are normalised by.
+
+    Raises:
+        NumericalError: it is 0, and a normalised score nothing.
+    """
+    mean = float(reference.mean())
+    if mean == 0:
+        raise NumericalError(
+            f"the teacher itself is never inside the band with any of {len(reference)} devices: "
+            "there is nothing to normalise scores by",
+            hint="start nearer or drive longer: protocol.x_m, protocol.theta_rad, protocol.steps",
+        )
+    return mean
 
 
 def first_crossing(gaps: Floats, scores: Floats, level: float, *, log: bool) -> Floats:
@@ -96,7 +121,7 @@ def first_crossing(gaps: Floats, scores: Floats, level: float, *, log: bool) -> 
 
     Args:
         gaps: ascending mean gaps between packets [P], in steps.
-        scores: [..., P].
+        scores: [..., P]; an undefined one (NaN) is not acceptable.
         level: 0.62 for scores.
         log: interpolate linearly in ln gap (= -ln p, delivery) instead of in the gap.
 
@@ -104,6 +129,7 @@ def first_crossing(gaps: Floats, scores: Floats, level: float, *, log: bool) -> 
         Gaps [...]; -inf where the first point is below already, +inf where no point is.
     """
     x = np.log(gaps) if log else np.asarray(gaps, dtype=np.float64)
+    scores = np.where(np.isnan(scores), -np.inf, scores)
     below = scores < level
     right = np.argmax(below, axis=-1)
     left = np.maximum(right - 1, 0)

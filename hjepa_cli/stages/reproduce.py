@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli import plan
-from hjepa_cli.checks import LINKLESS, TRUE_STATE
+from hjepa_cli.checks import LINKLESS, TRUE_STATE, check_schedulable
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.model import offered
 from hjepa_cli.core.plant import plant
@@ -70,8 +70,8 @@ def check(settings: Settings) -> None:
 
     Raises:
         UsageError: a baseline in place of the encoder, no method of which a model is trained here
-            or that has a link to schedule, trajectories too short for the strides or the horizon, a
-            bad SNR grid.
+            or that has a link to schedule, too few slots for it, trajectories too short for the
+            strides or the horizon, a bad SNR grid.
     """
     method, collected = settings.encoder.method, settings.collect
     if method != "jepa":
@@ -86,11 +86,14 @@ def check(settings: Settings) -> None:
             f"choose --methods from {', '.join(servable(settings))}",
             hint=f"train it on its own: {how_to_train(missing[0], settings)}",
         )
-    if settings.radio.law == "scheduled" and not set(settings.methods) - {*missing, *LINKLESS}:
-        raise UsageError(
-            f"law scheduled has nothing to schedule for {', '.join(settings.methods)}",
-            hint="choose --methods that have a link, as hjepa, or radio.law = 'duty'",
-        )
+    if settings.radio.law == "scheduled":
+        linked = [name for name in settings.methods if name not in (*missing, *LINKLESS)]
+        if not linked:
+            raise UsageError(
+                f"law scheduled has nothing to schedule for {', '.join(settings.methods)}",
+                hint="choose --methods that have a link, as hjepa, or radio.law = 'duty'",
+            )
+        check_schedulable(linked, settings.protocol.steps)
     check_stride(max(settings.encoder.h, settings.hierarchy.h), collected.steps)
     check_horizon(settings.protocol.horizon, collected.clean_steps)
     parse_snr(settings.radio.snr_db)

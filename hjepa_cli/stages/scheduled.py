@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import LINKLESS, RAW_FRAMES
+from hjepa_cli.checks import LINKLESS, check_schedulable
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.cell import Row, best_flat, ratio_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.scheduled import BLOCK_DEVICES
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.errors import MissingInputError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.scale import PAPER_GAIN_PERCENT, PAPER_SNR_DB, draw, enforce, write_csv
@@ -116,16 +116,13 @@ def open_schedulable(
     """Open what is to be simulated; returns it and its methods that share a band.
 
     Raises:
-        UsageError: a method whose packets do not fit into slots.
+        UsageError: a method whose packets do not fit into slots, or too few slots.
         MissingInputError: no such checkpoint, or none with any of the methods.
     """
-    if raw := [name for name in settings.methods if name in RAW_FRAMES]:
-        raise UsageError(
-            f"law scheduled fits packets into slots; {', '.join(raw)} needs several slots for one",
-            hint="choose --law duty for it, or other --methods",
-        )
+    linked = [name for name in settings.methods if name not in LINKLESS]
+    check_schedulable(linked, settings.protocol.steps)
     subject = open_subject(settings, screen, checkpoint, None, further)
-    methods = [name for name in subject.measurable(settings.methods) if name not in LINKLESS]
+    methods = subject.measurable(linked)
     if not methods:
         skipped = subject.skipped(settings.methods)
         hint = next(iter(skipped.values()), "choose a method that has a link")
