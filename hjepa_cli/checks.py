@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
+from hjepa_cli import systems
 from hjepa_cli.errors import UsageError
 from hjepa_cli.settings import EncoderSettings, RadioSettings, Settings, dotted
 
@@ -118,6 +119,11 @@ def check_settings(settings: Settings) -> None:
         raise UsageError(
             f"radio.bandwidth_hz = {settings.radio.bandwidth_hz:g}; "
             f"expected at most {LARGEST_BANDWIDTH_HZ:g}"
+        )
+    if settings.conditions.pole_length != 1 and settings.plant in systems.NAMES:
+        raise UsageError(
+            f"conditions.pole_length = {settings.conditions.pole_length:g}; "
+            f"plant {settings.plant} has no pole: leave it at 1"
         )
 
 

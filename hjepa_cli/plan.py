@@ -202,6 +202,7 @@ def plan_scale(
     verify: bool,
 ) -> Plan:
     """Plan of ``hjepa scale``."""
+    from hjepa_cli.stages.evaluate import check_rollouts
     from hjepa_cli.stages.subject import open_subject
 
     radio = settings.radio
@@ -209,6 +210,7 @@ def plan_scale(
         return _plan_scheduled(settings, checkpoint, out, snr_db, verify=verify)
     subject = open_subject(settings, Screen(quiet=True), checkpoint, dataset)
     subject.check_any(settings.methods)
+    check_rollouts(subject)
     methods = _timed(subject, snr_db)
     missing = _uncached(subject, methods, remeasure=remeasure)
     work = [

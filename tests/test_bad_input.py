@@ -100,6 +100,20 @@ def test_unknown_method_lists_the_methods(shell, command, methods):
     refused(shell, 2, command, "--methods", methods, says=METHODS)
 
 
+@pytest.mark.parametrize("command", ["collect", "eval", "scale"])
+@pytest.mark.parametrize("how", [[], ["--dry-run"]], ids=str)
+def test_what_fits_no_plant_or_rollout_is_refused_before_anything_is_made(shell, command, how):
+    Path("c.toml").write_text("[conditions]\npole_length = 1.1")
+    says = ["pole_length = 1.1", "quadrotor"]
+    with shell.untouched():
+        refused(shell, 2, command, "--plant", "quadrotor", "--config", "c.toml", *how, says=says)
+    if command != "collect":
+        Path("c.toml").write_text("[protocol]\nhorizon = 200")
+        says = ["horizon = 200", "have 120"]
+        with shell.untouched():
+            refused(shell, 2, command, "--quiet", "--config", "c.toml", *how, says=says)
+
+
 @pytest.mark.parametrize("command", ["train-encoder", "train-hierarchy", "eval", "scale"])
 def test_a_plan_refuses_the_folder_that_the_command_would(shell, command):
     Path("foreign").mkdir()

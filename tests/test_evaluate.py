@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from hjepa_cli.core.workers import ModelFile, open_workers, simulate, single_thr
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
-from hjepa_cli.stages import evaluate, scale
+from hjepa_cli.stages import evaluate, resume, scale
 from hjepa_cli.stages.train_encoder import describe_architecture
 from hjepa_cli.storage import curves, zoo
 from hjepa_cli.storage.checkpoints import save_checkpoint
@@ -325,9 +325,49 @@ def test_bad_requests_are_refused_before_anything_is_written(
     assert not Path("runs").exists()
 
 
-def test_a_horizon_beyond_the_clean_rollouts_is_refused(checkpoint: Path) -> None:
+@pytest.mark.parametrize("run", [evaluate.run, scale.run])
+def test_a_horizon_beyond_the_clean_rollouts_is_refused_at_once(
+    run: Callable[..., object], checkpoint: Path
+) -> None:
     with pytest.raises(UsageError, match="horizon = 25 needs clean rollouts of 26 steps"):
-        evaluate.run(small(horizon=25), Output().screen, checkpoint=str(checkpoint))
+        run(small(horizon=25), Output().screen, checkpoint=str(checkpoint))
+    assert not Path("runs").exists()
+
+
+def test_a_resumed_evaluation_draws_its_figure(checkpoint: Path) -> None:
+    pytest.importorskip("matplotlib")
+    out = Path("run")
+    settings = small(methods=("hold-true",))
+    whole = evaluate.run(settings, Output().screen, out=out, figure=True)
+    for path in (out / "result.json", *out.glob("comparison.*")):
+        path.unlink()
+    assert resume.run(out, Output().screen) == whole
+    assert {path.suffix for path in out.glob("comparison.*")} == {".png", ".svg", ".pdf"}
+
+
+def test_remeasure_replaces_damaged_curves_of_the_run_itself() -> None:
+    settings, out = small(methods=("hold-true",)), Path("run")
+    whole = evaluate.run(settings, Output().screen, out=out)
+    (out / "result.json").unlink()
+    (out / "curves.json").write_text("{")
+    with pytest.raises(DataError, match=r"curves\.json") as caught:
+        evaluate.run(settings, Output().screen, out=out)
+    assert "--remeasure" in str(caught.value.hint)
+    again = evaluate.run(settings, Output().screen, out=out, remeasure=True)
+    assert again["methods"] == whole["methods"]
+
+
+def test_anchors_are_fitted_in_one_thread_as_workers_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, build = [], evaluate.build_method
+
+    def watched(*given: Any) -> Any:
+        seen.append(torch.get_num_threads())
+        return build(*given)
+
+    torch.set_num_threads(2)
+    monkeypatch.setattr(evaluate, "build_method", watched)
+    evaluate.run(small(methods=("hold-true",)), Output().screen)
+    assert seen == [1] and torch.get_num_threads() == 2
 
 
 def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:

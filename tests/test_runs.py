@@ -129,6 +129,18 @@ def test_a_finished_run_is_repeated_not_redone() -> None:
     assert {path: path.read_bytes() for path in Path("out").iterdir()} == before
 
 
+def test_a_finished_run_does_not_pretend_to_have_done_what_it_was_not_asked_for() -> None:
+    Run.create("scale", Path("out"), SETTINGS, {"verify": False}).close()
+    with Run.create("scale", Path("out"), SETTINGS, {"verify": True}) as run:  # still to be done
+        run.finish({"verify": []})
+    for asked in (True, False):
+        with Run.create("scale", Path("out"), SETTINGS, {"verify": asked}) as run:
+            assert run.result == {"verify": []}
+    with pytest.raises(UsageError, match="out holds a run finished without --remeasure") as caught:
+        Run.create("scale", Path("out"), SETTINGS, {"verify": True, "remeasure": True})
+    assert "--out" in (caught.value.hint or "")
+
+
 def test_an_unfinished_run_is_taken_up_again() -> None:
     with Run.create("eval", Path("out"), SETTINGS) as run:
         for epoch in range(5):

@@ -39,6 +39,7 @@ def stage(tmp_path, monkeypatch):
         skipped = {name: "train it" for name in settings.methods if name not in ENTRIES}
         return SimpleNamespace(
             settings=settings,
+            dataset=None,
             asked=(checkpoint, dataset),
             skipped=lambda methods: skipped,
             check_any=lambda methods: None,

@@ -90,14 +90,21 @@ def single_thread(runner: Runner) -> Runner:
     """``runner`` in this process as workers do it, so that results are the same bytes."""
 
     def run(blocks: Sequence[Block], tick: Tick) -> list[Outcome]:
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with one_thread():
             return runner(blocks, tick)
-        finally:
-            torch.set_num_threads(threads)
 
     return run
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute as workers do, whose sums have one order."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 Follow = Callable[[Sequence[Future[Outcome]], Sequence[Block], Tick], None]

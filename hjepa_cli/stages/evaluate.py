@@ -22,8 +22,14 @@ from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Runner, Simulator
 from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
-from hjepa_cli.core.workers import ModelFile, cluster_runner, open_workers, single_thread
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.core.workers import (
+    ModelFile,
+    cluster_runner,
+    one_thread,
+    open_workers,
+    single_thread,
+)
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.screen import Screen, in_order, tolerance
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
@@ -68,7 +74,7 @@ def run(
         DataError: a damaged file, one of another plant, or a figure of models of different seeds.
     """
     subject = open_measurable(settings, screen, checkpoint, dataset, further, figure=figure)
-    inputs = subject.inputs(remeasure=remeasure)
+    inputs = subject.inputs(remeasure=remeasure, figure=figure)
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
         result = record.result
         if result is None:
@@ -103,6 +109,7 @@ def open_measurable(
         )
     subject = open_subject(settings, screen, checkpoint, dataset, further, one_seed=figure)
     subject.check_any(settings.methods)
+    check_rollouts(subject)
     if figure:
         subject.check_one_training_seed()
     return subject
@@ -182,7 +189,12 @@ def _curves_of(
     """The curves of methods that this subject's own model holds, and where they are."""
     own = record.path(CURVES_FILE if first else curves.further_file(subject.digest))
     found = {} if remeasure else curves.find(subject.digest, methods, subject.beside)
-    kept = curves.read(own, subject.digest)
+    kept: dict[str, Entry] = {}
+    try:
+        kept = curves.read(own, subject.digest)
+    except DataError:
+        if not remeasure:  # which is what its hint says
+            raise
     found |= {name: (kept[name], own) for name in methods if name in kept}
     keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
     missing = [name for name in methods if name not in found]
@@ -306,7 +318,8 @@ def _measure(
                 f"gives it {MIN_TEACHER_SCORE}): normalised scores say little"
             )
         for name in methods:
-            method = build_method(name, settings, subject.model)
+            with one_thread():  # as workers build it: anchors are fitted to the same bits
+                method = build_method(name, settings, subject.model)
             with _ticking(screen, f"eval {name}", _usual_device_steps(settings)) as tick:
                 bench.tick = tick
                 rollouts = (states, teacher_n, limit_n, protocol.horizon)
@@ -354,8 +367,14 @@ def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:
         rollouts = subject.dataset.split("clean")
     else:
         rollouts = generate(settings, "clean")
-    check_horizon(settings.protocol.horizon, rollouts.teacher_n.shape[1])
     return rollouts.states.astype("float64"), rollouts.teacher_n.astype("float64")
+
+
+def check_rollouts(subject: Subject) -> None:
+    """Raise UsageError where the subject's clean rollouts, once made, would be too short."""
+    settings, data = subject.settings, subject.dataset
+    steps = data.splits["clean"]["steps"] if data else settings.collect.clean_steps
+    check_horizon(settings.protocol.horizon, steps)
 
 
 def check_horizon(horizon: int, steps: int) -> None:

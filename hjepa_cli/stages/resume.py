@@ -69,6 +69,7 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
             out=directory,
             remeasure=remeasure,
             further=_further(inputs),
+            figure=bool(inputs.get("figure")),
         )
     if stage == "scale":
         from hjepa_cli.stages import scale
@@ -100,7 +101,9 @@ def planned(directory: Path) -> plan.Plan:
     stage, settings, inputs = recall(directory, Screen(quiet=True))
     dataset = _path(inputs, "dataset")
     checkpoint, encoder = _text(_path(inputs, "checkpoint")), _text(_path(inputs, "encoder"))
-    remeasure, verify = bool(inputs.get("remeasure")), bool(inputs.get("verify"))
+    remeasure, verify, figure = (
+        bool(inputs.get(flag)) for flag in ("remeasure", "verify", "figure")
+    )
     if stage == "collect":
         whole = plan.plan_collect(settings, directory)
     elif stage == "train-encoder":
@@ -108,7 +111,9 @@ def planned(directory: Path) -> plan.Plan:
     elif stage == "train-hierarchy":
         whole = plan.plan_train_hierarchy(settings, dataset, encoder, directory)
     elif stage == "eval":
-        whole = plan.plan_eval(settings, checkpoint, dataset, directory, remeasure=remeasure)
+        whole = plan.plan_eval(
+            settings, checkpoint, dataset, directory, remeasure=remeasure, figure=figure
+        )
     elif stage == "scale":
         from hjepa_cli.core.capacity import parse_snr
 

@@ -19,7 +19,7 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen, percent, span
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.evaluate import curves_for, measure_points
+from hjepa_cli.stages.evaluate import check_rollouts, curves_for, measure_points
 from hjepa_cli.stages.subject import Subject, open_subject
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
@@ -69,6 +69,7 @@ def run(
     grid_db = parse_snr(settings.radio.snr_db)
     subject = open_subject(settings, screen, checkpoint, dataset, further)
     subject.check_any(settings.methods)
+    check_rollouts(subject)
     level = settings.protocol.acceptable_score
     inputs = subject.inputs(remeasure=remeasure, verify=verify)
     with Run.create("scale", out, settings.as_dict(), inputs) as record:

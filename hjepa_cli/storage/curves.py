@@ -24,6 +24,7 @@ from hjepa_cli.storage.runs import ROOT
 from hjepa_cli.storage.zoo import CURVES_FILE
 
 SCHEMA = 1
+AGAIN = "measure them again with --remeasure, or delete the file"
 
 Entry = dict[str, Any]
 
@@ -121,7 +122,11 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
     """
     if not path.exists():
         return {}
-    document = files.read_json(path)
+    try:
+        document = files.read_json(path)
+    except DataError as error:
+        error.hint = AGAIN
+        raise
     files.check_schema(document.get("schema"), SCHEMA, str(path))
     if not isinstance(document.get("methods"), dict):
         raise _damaged(path, "no methods")
@@ -286,7 +291,4 @@ _LATER: dict[str, Check] = {  # came after the first curves that are still good
 
 
 def _damaged(path: Path, reason: str) -> DataError:
-    return DataError(
-        f"{path} holds no valid curves: {reason}",
-        hint="measure them again with --remeasure, or delete the file",
-    )
+    return DataError(f"{path} holds no valid curves: {reason}", hint=AGAIN)

@@ -33,6 +33,7 @@ ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
 EVENTS = "events.jsonl"
 RESULT = "result.json"
+ASKED = ("remeasure", "verify")  # flags that are work, which a finished run has done or has not
 
 SCHEMA = 2  # of environment.json; 1 had neither a schema nor inputs
 
@@ -192,9 +193,19 @@ class Run:
                     hint=f"{self.continue_command} {'shows' if finished else 'continues'} it as it "
                     "is; or choose another --out DIR",
                 )
+            further = [flag for flag in ASKED if inputs.get(flag)]
+            further = [flag for flag in further if not recorded["inputs"].get(flag)]
             if finished:
+                if further:
+                    raise UsageError(
+                        f"{self.directory} holds a run finished without --{further[0]}",
+                        hint="choose another --out DIR",
+                    )
                 self.result = files.read_json(self.path(RESULT))
                 return
+            if further:
+                recorded["inputs"] |= dict.fromkeys(further, True)
+                files.write_json(self.path(ENVIRONMENT), recorded)
             for name in (METRICS, EVENTS):
                 if self.path(name).exists():  # a kill may have cut the last line
                     files.write_text(self.path(name), "".join(_whole_lines(self.path(name))))
