@@ -195,7 +195,10 @@ def test_a_finished_run_is_shown_again_without_measuring(stage, tmp_path):
     first = stage(out=tmp_path / "here")
     printed = stage.out.getvalue()
     calls = len(stage.curves)
-    assert stage(out=tmp_path / "here", remeasure=True) == first
+    assert stage(out=tmp_path / "here") == first
+    for flag in ("remeasure", "verify"):
+        with pytest.raises(UsageError, match=f"finished without --{flag}"):
+            stage(out=tmp_path / "here", **{flag: True})
     assert len(stage.curves) == calls
     assert stage.out.getvalue() == printed
     with pytest.raises(UsageError, match=r"a finished run with other settings: radio\.snr_db = "):
