@@ -196,11 +196,11 @@ def test_a_finished_run_is_shown_again_without_measuring(stage, tmp_path):
     printed = stage.out.getvalue()
     calls = len(stage.curves)
     assert stage(out=tmp_path / "here") == first
+    assert stage.out.getvalue() == printed
     for flag in ("remeasure", "verify"):
         with pytest.raises(UsageError, match=f"finished without --{flag}"):
             stage(out=tmp_path / "here", **{flag: True})
     assert len(stage.curves) == calls
-    assert stage.out.getvalue() == printed
     with pytest.raises(UsageError, match=r"a finished run with other settings: radio\.snr_db = "):
         stage(out=tmp_path / "here", snr="10:20")
 
