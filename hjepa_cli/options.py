@@ -388,7 +388,8 @@ Verify = Annotated[
     _plain(
         LOOP,
         "--verify",
-        "Simulate again at 0.9 and 1.1 of each tolerance or load, and check the sides of the limit.",
+        "Simulate again at 0.9 and 1.1 of each tolerance or load, and check the sides of the "
+        "limit.",
     ),
 ]
 
