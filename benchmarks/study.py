@@ -114,8 +114,8 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
     if changes.get("encoder", {}).get("method", "jepa") != "jepa":  # on raw frames, no levels
         return {"health": trained["health"], "methods": evaluate(encoder, methods)}
 
-    def levels(strides: list[int] | None, on: Path) -> tuple[Path, dict[str, Any]]:
-        of = directory("train-hierarchy", strides)
+    def levels(strides: list[int] | None, on: Path, *more: str) -> tuple[Path, dict[str, Any]]:
+        of = directory("train-hierarchy", strides, *more)
         given = zip("hml", strides or (), strict=False)
         words = [f"--{name}={value}" for name, value in given]
         health = run("train-hierarchy", *words, "--dataset", data, "--encoder", on, "--out", of)
@@ -125,7 +125,8 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
     hierarchy, health = levels(strides, encoder)
     measured = evaluate(hierarchy, methods, strides)
     for depth in row.get("flat", ()):
-        measured |= evaluate(levels([depth], hierarchy)[0], [f"ts-jepa-{depth}"], strides)
+        flat, _ = levels([depth], hierarchy, hierarchy.name)  # with that model's actor
+        measured |= evaluate(flat, [f"ts-jepa-{depth}"], strides)
     return {"health": health, "methods": measured}  # of the actor that drives, not of a probe
 
 

@@ -279,6 +279,8 @@ def plan_export(
     data = load_dataset(path or newest())
     described = data.splits[split]
     rows = described["trajectories"] * (described["steps"] + 1)
+    system = plant(data.plant)
+    row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
     frames = rows if pixels else 0
     work = [f"gather {rows} rows of split {split}"]
     if frames and data.frames == "rendered":
@@ -288,7 +290,7 @@ def plan_export(
         reads=[f"dataset {data.path}"],
         work=work,
         writes=[f"{kind} file {out or default_name(data, split, kind)}"],
-        writes_bytes=rows * 24 + frames * COMPRESSED_FRAME_BYTES,
+        writes_bytes=rows * row_bytes + frames * COMPRESSED_FRAME_BYTES,
         seconds=1 + frames / RATES_PER_S["rendered frames"] + frames / COMPRESSED_FRAMES_PER_S,
     )
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hjepa_cli.checks import TRUE_STATE
+from hjepa_cli.checks import LINKLESS, TRUE_STATE
 from hjepa_cli.errors import HjepaError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
@@ -17,7 +17,6 @@ from hjepa_cli.settings import Settings
 if TYPE_CHECKING:
     from hjepa_cli.stages.subject import Subject
 
-FRAME_BYTES = 64 * 128 * 3
 ENCODER_PARAMETERS = 700_000
 RATES_PER_S = {  # two cores of a server CPU
     "simulated steps": 400_000.0,
@@ -35,8 +34,6 @@ TRAINED = {  # by train-encoder --method: loops, and what they train
     "autoencoder": (2, "reconstruction, then reconstructed frames to force,"),
 }
 SEARCH_POINTS = 6  # of a tolerance, as a rule
-
-SEARCH_LOADS, BLOCK_DEVICES = 8, 200  # of the law scheduled, as in core/scheduled.py
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +76,7 @@ def plan_collect(settings: Settings, out: Path | None) -> Plan:
     trajectories = options.trajectories + options.test_trajectories
     steps = trajectories * options.steps + options.clean_trajectories * options.clean_steps
     frames = steps + trajectories + options.clean_trajectories
+    from hjepa_cli.stages.collect import size_bytes
     from hjepa_cli.storage.datasets import per_shard
 
     stored = options.frames == "stored"
@@ -95,7 +93,7 @@ def plan_collect(settings: Settings, out: Path | None) -> Plan:
         reads=[],
         work=work,
         writes=[f"dataset {out or f'data/{settings.plant}-<next number>'} in {shards} shards"],
-        writes_bytes=frames * (16 + (FRAME_BYTES if stored else 0)) + steps * 8,
+        writes_bytes=size_bytes(settings),
         seconds=2 + _seconds({"simulated steps": steps, "rendered frames": frames * stored}),
     )
 
@@ -105,7 +103,7 @@ def plan_train_encoder(settings: Settings, dataset: Path | None, out: Path | Non
     options = settings.encoder
     batch = options.batch_trajectories * options.batch_frames
     frames = _frames(settings)
-    epochs = options.steps * batch / max(frames, 1)
+    epochs = options.steps * batch / (settings.collect.trajectories * (settings.collect.steps + 1))
     loops, what = TRAINED[options.method]
     return Plan(
         command="train-encoder",
@@ -144,12 +142,14 @@ def plan_train_hierarchy(
         steps = options.coarse_steps + options.flat_steps
         steps += options.medium_steps + options.low_steps
     parameters = ENCODER_PARAMETERS + (2 if h == m == l else 4) * _predictor(settings, h)
+    views = 1 + (options.shifted_copies if settings.encoder.shift_px else 0)
+    views *= 2 if settings.encoder.mirror == "augment" else 1
     return Plan(
         command="train-hierarchy",
         reads=[_dataset(dataset, settings), _encoder(encoder, settings)],
         work=[
-            f"render and encode about {frames} frames, "
-            f"those for training {1 + options.shifted_copies} times",
+            f"render and encode about {frames} frames"
+            + f", those for training {views} times" * (views > 1),
             f"train {levels}, ts-jepa-1 and the actor ({steps} steps)",
         ],
         writes=[f"run {_run('train-hierarchy', out)}"],
@@ -158,7 +158,7 @@ def plan_train_hierarchy(
         + _seconds(
             {
                 "rendered frames": frames,
-                "encoded frames": (2 + options.shifted_copies) * frames,
+                "encoded frames": (1 + views) * frames,
                 "level training steps": steps,
             }
         ),
@@ -255,14 +255,21 @@ def reproduce_parts(settings: Settings) -> dict[str, tuple[list[str], float]]:
         plan_train_encoder(settings, None, None),
         plan_train_hierarchy(settings, None, None, None),
     )
-    methods = list(settings.methods)
+    from hjepa_cli.core.capacity import parse_snr
+    from hjepa_cli.stages.reproduce import left_out
+
+    methods = [name for name in settings.methods if name not in left_out(settings)]
+    counting: tuple[list[str], float] = (["count devices"], 5.0)
+    if settings.radio.law == "scheduled":
+        linked = [name for name in methods if name not in LINKLESS]
+        counting = _scheduled_work(settings, linked, parse_snr(settings.radio.snr_db), verify=False)
     return {
         **{part.command: (part.work, part.seconds) for part in training},
         "eval": (
             [f"measure the curves of {', '.join(methods)}"],
             5 + _loop_seconds(settings, methods),
         ),
-        "scale": (["count devices"], 5.0),
+        "scale": counting,
     }
 
 
@@ -299,28 +306,38 @@ def _plan_scheduled(
     """Plan of ``hjepa scale --law scheduled``: every load is simulated, none is cached."""
     from hjepa_cli.stages.scheduled import open_schedulable
 
-    radio = settings.radio
     subject, methods = open_schedulable(settings, Screen(quiet=True), checkpoint)
-    searches = len(radio.schedulers) * radio.seeds
-    if radio.load_depends_on_snr:
-        searches *= len(snr_db)
-    work = [
-        f"simulate up to {SEARCH_LOADS} loads of about {BLOCK_DEVICES} devices for "
-        f"{settings.protocol.steps} slots in each of {searches} searches for "
-        f"{len(methods)} methods under {', '.join(radio.schedulers)}"
-    ]
-    loads = searches * SEARCH_LOADS
-    if verify:
-        work.append("simulate each load again, a little lighter and a little heavier")
-        loads += 2 * searches
+    work, seconds = _scheduled_work(settings, methods, snr_db, verify=verify)
     return Plan(
         command="scale",
         reads=[f"model {subject.name}"],
         work=work,
         writes=[f"run {_run('scale', out)} with the table (CSV) and the figure"],
         writes_bytes=300_000,
-        seconds=5 + _drive_seconds(settings, methods, loads * BLOCK_DEVICES),
+        seconds=seconds,
     )
+
+
+def _scheduled_work(
+    settings: Settings, methods: list[str], snr_db: list[float], *, verify: bool
+) -> tuple[list[str], float]:
+    """What the searches of law scheduled do, and about how many seconds they take."""
+    from hjepa_cli.core.scheduled import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
+
+    radio = settings.radio
+    searches = len(radio.schedulers) * radio.seeds
+    if radio.load_depends_on_snr:
+        searches *= len(snr_db)
+    work = [
+        f"simulate up to {MAX_BISECTIONS + 2 * MAX_WIDENINGS} loads of about {BLOCK_DEVICES} "
+        f"devices for {settings.protocol.steps} slots in each of {searches} searches for "
+        f"{len(methods)} methods under {', '.join(radio.schedulers)}"
+    ]
+    loads = searches * MAX_BISECTIONS  # as a rule
+    if verify:
+        work.append("simulate each load again, a little lighter and a little heavier")
+        loads += 2 * searches
+    return work, 5 + _drive_seconds(settings, methods, loads * BLOCK_DEVICES)
 
 
 def size(count: float) -> str:

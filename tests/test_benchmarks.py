@@ -191,6 +191,24 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
     assert {words[words.index("--seed") + 1] for words in ran} == {"3"}
 
 
+def test_single_levels_with_the_actors_of_two_models_are_two(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    study, made = load("study"), dict[str, set[str]]()
+
+    def pretended(*words: object) -> dict[str, object]:
+        if words[0] == "train-hierarchy":
+            encoder, out = (str(words[words.index(flag) + 1]) for flag in ("--encoder", "--out"))
+            made.setdefault(out, set()).add(encoder)
+        return {"health": {}, "methods": {}}
+
+    monkeypatch.setattr(study, "hjepa", pretended)
+    for strides in ([4, 2, 1], [8, 2, 1]):
+        row = {"name": str(strides), "strides": strides, "flat": [2]}
+        study.measure(row, 0, ["hjepa"], tmp_path)
+    assert len(made) == 4 and all(len(encoders) == 1 for encoders in made.values())
+
+
 def test_intervals_of_a_study_are_students_over_seeds() -> None:
     over_seeds = load("study").over_seeds
     values = [170.0, 174.0, 181.0]

@@ -20,6 +20,7 @@ from typer.main import get_command
 
 from hjepa_cli import __version__
 from hjepa_cli.cli import app
+from hjepa_cli.core import scheduled
 from hjepa_cli.errors import (
     DataError,
     LockedError,
@@ -29,6 +30,7 @@ from hjepa_cli.errors import (
     UsageError,
 )
 from hjepa_cli.settings import PRESETS, load_settings
+from hjepa_cli.stages import collect
 
 MODULES = {
     "collect": "collect",
@@ -347,7 +349,7 @@ def test_dry_run_tells_cached_curves_from_those_to_measure(shell):
     assert after["seconds"] < again["seconds"]
 
 
-def test_dry_run_follows_the_flags(shell, stage):
+def test_dry_run_follows_the_flags(shell):
     small, large, stored = (
         shell("collect", "--dry-run", "--json", *flags.split()).document["plan"]
         for flags in ("--trajectories 10", "--trajectories 1000", "--frames stored")
@@ -358,6 +360,40 @@ def test_dry_run_follows_the_flags(shell, stage):
     assert stored["writes_bytes"] == pytest.approx(29_080 * 24_576, rel=0.01)
     named = shell("train-encoder", "--dry-run", "--out", "here").out
     assert "here" in named
+
+
+@pytest.mark.parametrize("preset", ["default", "quadrotor"])
+def test_dry_run_promises_the_size_that_collect_needs(shell, preset):
+    plan = shell("collect", "--dry-run", "--json", "--preset", preset).document["plan"]
+    assert plan["writes_bytes"] == collect.size_bytes(load_settings(preset))
+
+
+@pytest.mark.parametrize(("preset", "passes"), [("default", 15), ("paper", 148)])
+def test_dry_run_counts_passes_over_the_training_frames(shell, preset, passes):
+    plan = shell("train-encoder", "--dry-run", "--json", "--preset", preset).document["plan"]
+    assert f"({passes} passes over the data)" in plan["work"][1]
+
+
+@pytest.mark.parametrize(
+    ("encoder", "times"),
+    [
+        ("", ", those for training 5 times"),
+        ("shift_px = 0", ""),
+        ('mirror = "augment"', ", those for training 10 times"),
+        ('mirror = "augment"\nshift_px = 0', ", those for training 2 times"),
+    ],
+)
+def test_dry_run_counts_the_copies_that_the_hierarchy_learns_from(shell, encoder, times):
+    Path("c.toml").write_text(f"[encoder]\n{encoder}")
+    arguments = ("train-hierarchy", "--config", "c.toml", "--dry-run", "--json")
+    encoding = shell(*arguments).document["plan"]["work"][0]
+    assert encoding.partition(" frames")[2] == times
+
+
+def test_dry_run_bounds_the_loads_of_a_search(shell):
+    flags = ("scale", "--law", "scheduled", "--methods", "oracle", "--dry-run", "--json")
+    most = scheduled.MAX_BISECTIONS + 2 * scheduled.MAX_WIDENINGS
+    assert f"up to {most} loads" in shell(*flags).document["plan"]["work"][0]
 
 
 def test_dry_run_still_refuses_what_the_command_would(shell):

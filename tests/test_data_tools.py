@@ -174,6 +174,16 @@ def test_bad_exports_are_refused_before_anything_is_written(shell):
     assert "render 36 frames" in plan["work"]
 
 
+def test_the_size_that_an_export_promises_follows_the_plant(shell):
+    Path("tiny.toml").write_text("[collect]\ntrajectories = 2\nsteps = 500")
+    made = ("--config", "tiny.toml", "--preset", "quadrotor", "--out", "q")
+    assert shell("collect", *made, "--quiet").code == 0
+    arguments = ("data", "export", "q", "--no-pixels", "--out", "q.npz", "--json")
+    plan = shell(*arguments, "--dry-run").document["plan"]
+    written = shell(*arguments).document
+    assert plan["writes_bytes"] == written["rows"] * 4 * (6 + 2 + 2)
+
+
 # --- config show
 
 

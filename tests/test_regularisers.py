@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hjepa_cli.core.regularisers import REGULARISERS, sigreg, vicreg
+from hjepa_cli.core.regularisers import REGULARISERS, Sigreg, sigreg, vicreg
 
 
 def test_vicreg_of_correlated_values() -> None:
@@ -36,7 +36,29 @@ def test_sigreg_of_normal_samples_is_their_sampling_error() -> None:
 def test_sigreg_of_a_collapsed_batch() -> None:
     """φ_N = 1: ∫ (1 − exp(−t²/2))² exp(−t²/2) dt."""
     expected = math.sqrt(2 * math.pi) * (1 - math.sqrt(2) + 1 / math.sqrt(3))
-    assert sigreg(torch.zeros(10, 4)).item() == pytest.approx(expected, rel=1e-3)
+    assert sigreg(torch.zeros(10, 4), torch.eye(4)).item() == pytest.approx(expected, rel=1e-3)
+
+
+def test_sigreg_never_looks_along_the_same_directions_again() -> None:
+    """Not even when torch is seeded anew, as by the probe that watches every epoch."""
+    z = torch.randn(64, 8, generator=torch.Generator().manual_seed(0))
+    term, values = Sigreg(0), []
+    before = torch.get_rng_state()
+    for _ in range(3):
+        values.append(term(z).item())
+        torch.manual_seed(0)
+    torch.set_rng_state(before)
+    assert len(set(values)) == 3
+    assert Sigreg(0)(z).item() == values[0] != Sigreg(1)(z).item()
+    assert torch.equal(torch.get_rng_state(), before)  # it draws nothing from torch's stream
+
+
+def test_sigreg_goes_on_where_its_state_was_saved() -> None:
+    z = torch.randn(64, 8, generator=torch.Generator().manual_seed(0))
+    term, resumed = Sigreg(0), Sigreg(0)
+    term(z)
+    resumed.load_state_dict(term.state_dict())
+    assert resumed(z).item() == term(z).item()
 
 
 @pytest.mark.parametrize("name", REGULARISERS)
@@ -44,20 +66,19 @@ def test_following_the_gradient_spreads_a_collapsed_batch(name: str) -> None:
     torch.manual_seed(0)
     z = (0.01 * torch.randn(64, 4)).requires_grad_()
     optimiser = torch.optim.Adam([z], lr=0.05)
-    before = REGULARISERS[name](z).item()
+    term = REGULARISERS[name](0)
+    before = term(z).item()
     for _ in range(60):
         optimiser.zero_grad()
-        REGULARISERS[name](z).backward()
+        term(z).backward()
         optimiser.step()
-    assert REGULARISERS[name](z).item() < 0.5 * before
+    assert term(z).item() < 0.5 * before
     assert z.std(0).min() > 0.2
 
 
 @pytest.mark.parametrize("name", REGULARISERS)
 def test_they_stay_in_float32_under_autocast(name: str) -> None:
     z = torch.randn(32, 8, generator=torch.Generator().manual_seed(0))
-    torch.manual_seed(0)
-    exact = REGULARISERS[name](z)
-    torch.manual_seed(0)
+    exact = REGULARISERS[name](0)(z)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert REGULARISERS[name](z) == exact
+        assert REGULARISERS[name](0)(z) == exact

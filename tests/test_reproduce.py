@@ -106,6 +106,20 @@ def test_dry_run_plans_all_stages_and_writes_nothing(shell, preset):
     assert plan["seconds"] > single["seconds"]
 
 
+def test_dry_run_plans_the_law_and_the_methods_of_the_settings(shell):
+    def plan(law, methods="hjepa,oracle,optimal"):
+        Path("c.toml").write_text(f"[radio]\nlaw = {law!r}")
+        arguments = ("reproduce", "--config", "c.toml", "--methods", methods, "--dry-run", "--json")
+        return shell(*arguments).document["plan"]
+
+    scheduled, duty = plan("scheduled"), plan("duty")
+    assert duty["work"][-1] == "scale: count devices"
+    assert scheduled["work"][-1].startswith("scale: simulate up to ")
+    assert "for 2 methods" in scheduled["work"][-1]  # optimal has no link
+    assert scheduled["seconds"] > duty["seconds"]
+    assert plan("duty", "hjepa,supervised-2")["work"][-2].endswith("the curves of hjepa")
+
+
 @pytest.mark.parametrize(
     ("flags", "config", "says"),
     [

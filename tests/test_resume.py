@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -162,6 +163,19 @@ def test_interrupted_at_any_step_and_continued_is_uninterrupted(
                 interruptions += 1
     assert interruptions == (2 if stage == "train-encoder" else 3)
     assert_equal_runs(out, workplace / stage)
+
+
+def test_sigreg_goes_on_along_the_directions_that_it_would_have_had(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = settings(encoder__regulariser="sigreg", encoder__regulariser_weight=1.0)
+    skip_actor(monkeypatch)
+    for name in ("whole", "interrupted", "interrupted"):
+        with monkeypatch.context() as patched, suppress(Interrupted):
+            if name == "interrupted":
+                signal_after(patched, 3)
+            train_encoder.run(chosen, QUIET, dataset=workplace / "data", out=tmp_path / name)
+    assert_equal_runs(tmp_path / "whole", tmp_path / "interrupted")
 
 
 @pytest.mark.parametrize("stage", STEPS)

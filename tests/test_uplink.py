@@ -110,5 +110,5 @@ def test_a_flood_of_reports_does_not_deafen_the_base_station():
         uplink.hear(np.ones(40, dtype=bool), np.full(40, 0.9))
         uplink.grant()
         uplink._reported[:] = 0.0  # as if all had been served: they will report again
-    assert uplink.delta == pytest.approx(0.01)
+    assert uplink._delta == pytest.approx(0.01)
     assert looks == 40 * 3 - 5  # every eighth slot each, but for the first slot

@@ -139,7 +139,7 @@ def test_shipped_models_are_whole() -> None:
         methods = set(json.loads((root / name / zoo.CURVES_FILE).read_text())["methods"])
         if model.metadata["architecture"]["kind"] == "hierarchy":
             assert methods >= {"hjepa", "ts-jepa-1", "hold", "oracle"}
-        card = (root / name / zoo.CARD_FILE).read_text(encoding="utf-8")
+        card = (root / name / "README.md").read_text(encoding="utf-8")
         assert card.startswith("---\n"), "a card begins with YAML front matter"
 
 

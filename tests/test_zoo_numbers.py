@@ -40,7 +40,7 @@ def shown_of(model):
 
 
 def card_of(name):
-    return (zoo.zoo_directory() / name / zoo.CARD_FILE).read_text(encoding="utf-8")
+    return (zoo.zoo_directory() / name / "README.md").read_text(encoding="utf-8")
 
 
 def rows_of(card):

@@ -11,7 +11,7 @@ from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.hierarchy import rollout_loss
 from hjepa_cli.core.losses import InverseDynamics
 from hjepa_cli.core.predictors import Predictor
-from hjepa_cli.core.regularisers import REGULARISERS
+from hjepa_cli.core.regularisers import REGULARISERS, Regulariser
 
 
 class Jepa:
@@ -24,6 +24,7 @@ class Jepa:
         inverse_dynamics: weight of the inverse-dynamics loss; 0 leaves it out.
         regulariser: ``"none"``, or one of :data:`~hjepa_cli.core.regularisers.REGULARISERS`.
         regulariser_weight: of its term.
+        seed: of what it draws.
         rollout_strides: length of the training rollouts in strides.
         forces: how many drive a device.
         mirror: as for :class:`Predictor`, of the auxiliary task.
@@ -42,6 +43,7 @@ class Jepa:
         mirror: Sequence[float] | None = None,
         regulariser: str = "none",
         regulariser_weight: float = 0.0,
+        seed: int = 0,
     ) -> None:
         self.encoder, self.predictor = encoder.to(device), predictor.to(device)
         self.target = EmaTarget(encoder, ema_decay)
@@ -52,9 +54,10 @@ class Jepa:
             self.weights["inverse_dynamics"] = inverse_dynamics
             self.inverse = InverseDynamics(encoder.embedding, forces=forces, mirror=mirror)
             self.inverse.to(device)
-        self.regulariser = regulariser
+        self.regularise: dict[str, Regulariser] = {}
         if regulariser != "none":
             self.weights[regulariser] = regulariser_weight
+            self.regularise[regulariser] = REGULARISERS[regulariser](seed)
         self.device = device
 
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
@@ -78,8 +81,8 @@ class Jepa:
             terms["inverse_dynamics"] = self.inverse.loss(
                 z[:, :-1].flatten(0, 1), z[:, 1:].flatten(0, 1), actions.mean(2).flatten(0, 1)
             )
-        if self.regulariser != "none":
-            terms[self.regulariser] = REGULARISERS[self.regulariser](z.flatten(0, 1))
+        for name, regularise in self.regularise.items():
+            terms[name] = regularise(z.flatten(0, 1))
         return terms
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
@@ -98,7 +101,8 @@ class Jepa:
     def parts(self) -> dict[str, nn.Module]:
         """Everything that training changes, the target included, by name."""
         parts = {"encoder": self.encoder, "companion": self.predictor, "target": self.target.module}
-        return parts if self.inverse is None else parts | {"inverse": self.inverse}
+        drawing = {name: one for name, one in self.regularise.items() if isinstance(one, nn.Module)}
+        return parts | drawing | ({} if self.inverse is None else {"inverse": self.inverse})
 
     def parameters(self) -> Iterator[nn.Parameter]:
         """Everything the optimiser trains (the target is not among it)."""

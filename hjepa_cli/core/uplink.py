@@ -114,11 +114,6 @@ class Uplink:
         self.sampled = np.zeros(devices, dtype=bool)
         self.reports = 0
 
-    @property
-    def delta(self) -> float:
-        """δ, the innovation from which on devices report; the base station broadcasts it."""
-        return self._delta
-
     def begin(self) -> None:
         """Start a slot: new fading."""
         self._gain = next(self._fading)

@@ -164,6 +164,7 @@ def train_jepa(modules: nn.ModuleDict, training: Training) -> dict[str, Any]:
         mirror=kind.force_signs if options.mirror == "exact" else None,
         regulariser=options.regulariser,
         regulariser_weight=options.regulariser_weight,
+        seed=settings.seed,
     )
 
     def look(terms: dict[str, float]) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from hjepa_cli.storage import files
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 
 CURVES_FILE = "curves.json"
-CARD_FILE = "README.md"
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 
