@@ -35,6 +35,7 @@ TEXT, NAME = font(12), font(14)  # below 12 px, Pillow's letters swallow the bla
 ARRIVED, LOST = (0, 158, 115), (213, 94, 0)  # safe for colour-blind readers
 DASH_PX = 7
 COLOURS = 48  # of a GIF
+MOST_GIF_FPS = 50  # viewers take a single hundredth of a second for ten
 
 
 class Pictures:
@@ -152,15 +153,20 @@ class Pictures:
                 draw.line([(column, bottom - 2), (column, bottom)], fill=LOST)
 
 
-def check_target(path: Path) -> None:
+def check_target(path: Path, fps: int) -> None:
     """Refuse a file that we could not write, before anything is simulated.
 
     Raises:
-        UsageError: neither .gif nor .mp4.
+        UsageError: neither .gif nor .mp4, or more pictures per second than a GIF holds.
         MissingInputError: MP4 without its library.
     """
     if path.suffix not in FORMATS:
         raise UsageError(f"no animation format '{path.suffix}'; --out FILE.gif or FILE.mp4")
+    if path.suffix == ".gif" and fps > MOST_GIF_FPS:
+        raise UsageError(
+            f"--fps {fps}: a GIF holds at most {MOST_GIF_FPS} pictures per second",
+            hint=f"--fps {MOST_GIF_FPS}, or --out FILE.mp4",
+        )
     if path.suffix == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401 - only whether it is there
@@ -169,6 +175,11 @@ def check_target(path: Path) -> None:
                 "MP4 needs imageio-ffmpeg, which is not installed",
                 hint='pip install "hjepa[video]", or --out FILE.gif',
             ) from None
+
+
+def true_fps(path: Path, fps: int) -> float:
+    """Pictures per second that the file holds."""
+    return 1000 / _gif_ms(fps) if path.suffix == ".gif" else fps
 
 
 def write(pictures: Pictures, path: Path, fps: int, tick: Callable[[], None]) -> None:
@@ -185,9 +196,14 @@ def _gif(pictures: Pictures, fps: int, tick: Callable[[], None]) -> bytes:
         tick()
     encoded = io.BytesIO()
     shots[0].save(
-        encoded, "GIF", save_all=True, append_images=shots[1:], duration=round(1000 / fps), loop=0
+        encoded, "GIF", save_all=True, append_images=shots[1:], duration=_gif_ms(fps), loop=0
     )
     return encoded.getvalue()
+
+
+def _gif_ms(fps: int) -> int:
+    """How long a GIF shows a picture: whole hundredths of a second."""
+    return 10 * round(100 / fps)
 
 
 def _palette(picture: Image.Image) -> Image.Image:

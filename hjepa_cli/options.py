@@ -629,7 +629,7 @@ Fps = Annotated[
     int,
     typer.Option(
         "--fps",
-        help="Pictures per second.",
+        help="Pictures per second; at most 50 in a GIF, which shows each for whole 10 ms.",
         metavar="N",
         parser=whole_number(1),
         rich_help_panel=LOOP,

@@ -249,6 +249,21 @@ def test_a_gif_keeps_the_colours_of_the_strip(tmp_path):
         assert (np.abs(shown.astype(int) - colour).max(axis=1) <= 1).any(), colour
 
 
+@pytest.mark.parametrize(("fps", "shown_ms"), [(1, 1000), (24, 40), (30, 30), (45, 20), (50, 20)])
+def test_the_rate_that_is_told_is_the_gif_s(tmp_path, fps, shown_ms):
+    path = tmp_path / "a.gif"
+    animation.write(pictures(steps=20), path, fps, lambda: None)
+    with image_module.open(path) as image:
+        assert image.info["duration"] == shown_ms
+    assert animation.true_fps(path, fps) == pytest.approx(1000 / shown_ms)
+    assert animation.true_fps(Path("a.mp4"), fps) == fps
+
+
+def test_view_tells_the_rate_that_it_wrote(shell, checkpoint):
+    arguments = ("view", "--checkpoint", checkpoint, "--config", "small.toml", "--every", "6")
+    assert "2 pictures at 33.3 per second" in shell(*arguments, "--fps", "30").err
+
+
 def test_view_writes_mp4(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     import imageio_ffmpeg
@@ -289,6 +304,7 @@ def test_what_cannot_be_viewed_is_refused(shell, checkpoint):
         assert_one_line_error(shell(*oracle), 2, "oracle", "hjepa")
         assert_one_line_error(shell(*oracle, "--dry-run"), 2, "oracle", "hjepa")
         assert_one_line_error(shell("view", "--out", "a.avi", *small), 2, ".avi", ".mp4")
+        assert_one_line_error(shell("view", "--fps", "60", *small), 2, "--fps 60", "50", ".mp4")
         assert_one_line_error(shell("view", "--live", *small), 2, "terminal")
         assert_one_line_error(shell("view", "--delivery", "0", *small), 2, "--delivery")
         assert_one_line_error(shell("view", "--snr", "nan", *small), 2, "--snr")

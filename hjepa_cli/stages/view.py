@@ -130,11 +130,12 @@ def run(
         delivery: share of packets that arrive.
         gap_steps: instead of fading, one packet every so many steps.
         every: control steps between pictures; default: a hundred pictures in all.
-        fps: pictures per second.
+        fps: pictures per second; a GIF takes the nearest rate that it can hold.
         live: play in the terminal instead of writing a file.
 
     Raises:
-        UsageError: a method that predicts no embedding, a format we do not write, no terminal.
+        UsageError: a method that predicts no embedding, a format we do not write, more pictures
+            per second than a GIF holds, no terminal.
         MissingInputError: no model, or a library is missing.
     """
     try:
@@ -147,7 +148,7 @@ def run(
             "a view needs Pillow, which is not installed", hint='pip install "hjepa[plot]"'
         ) from None
     if not live:
-        animation.check_target(out)
+        animation.check_target(out, fps)
         files.make_directory(out.parent)
     elif not screen.is_terminal:
         raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
@@ -177,7 +178,8 @@ def run(
         return result
     with screen.progress("draw", len(pictures), "pictures") as bar:
         animation.write(pictures, out, fps, bar.advance)
-    screen.say(f"{len(pictures)} pictures at {fps} per second: {out}")
+    rate = animation.true_fps(out, fps)
+    screen.say(f"{len(pictures)} pictures at {round(rate, 1):g} per second: {out}")
     return result
 
 
