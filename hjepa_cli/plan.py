@@ -202,15 +202,12 @@ def plan_scale(
     verify: bool,
 ) -> Plan:
     """Plan of ``hjepa scale``."""
-    from hjepa_cli.stages.evaluate import check_rollouts
-    from hjepa_cli.stages.subject import open_subject
+    from hjepa_cli.stages.evaluate import open_measurable
 
     radio = settings.radio
     if radio.law == "scheduled":
         return _plan_scheduled(settings, checkpoint, out, snr_db, verify=verify)
-    subject = open_subject(settings, Screen(quiet=True), checkpoint, dataset)
-    subject.check_any(settings.methods)
-    check_rollouts(subject)
+    subject = open_measurable(settings, Screen(quiet=True), checkpoint, dataset)
     methods = _timed(subject, snr_db)
     missing = _uncached(subject, methods, remeasure=remeasure)
     work = [

@@ -33,16 +33,14 @@ def stage(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     calls = []
 
-    def open_subject(settings, screen, checkpoint, dataset, further=None):
+    def open_measurable(settings, screen, checkpoint, dataset, further=None):
         if checkpoint == "missing":
             raise MissingInputError("no model 'missing'")
         skipped = {name: "train it" for name in settings.methods if name not in ENTRIES}
         return SimpleNamespace(
             settings=settings,
-            dataset=None,
             asked=(checkpoint, dataset),
             skipped=lambda methods: skipped,
-            check_any=lambda methods: None,
             measurable=lambda methods: [name for name in methods if name in ENTRIES],
             inputs=lambda **flags: flags,
         )
@@ -53,7 +51,7 @@ def stage(tmp_path, monkeypatch):
         model = {"checkpoint": "model", "checkpoints": {}}
         return model | {"methods": found, "source": "curves of the test"}
 
-    monkeypatch.setattr(scale, "open_subject", open_subject)
+    monkeypatch.setattr(scale, "open_measurable", open_measurable)
     monkeypatch.setattr(scale, "curves_for", curves_for)
 
     def call(

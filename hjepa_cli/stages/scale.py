@@ -19,8 +19,8 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.screen import Screen, percent, span
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.evaluate import check_rollouts, curves_for, measure_points
-from hjepa_cli.stages.subject import Subject, open_subject
+from hjepa_cli.stages.evaluate import curves_for, measure_points, open_measurable
+from hjepa_cli.stages.subject import Subject
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
 
@@ -67,9 +67,7 @@ def run(
     if settings.radio.law == "scheduled":
         return run_scheduled(settings, screen, checkpoint, out, verify, further)
     grid_db = parse_snr(settings.radio.snr_db)
-    subject = open_subject(settings, screen, checkpoint, dataset, further)
-    subject.check_any(settings.methods)
-    check_rollouts(subject)
+    subject = open_measurable(settings, screen, checkpoint, dataset, further)
     level = settings.protocol.acceptable_score
     inputs = subject.inputs(remeasure=remeasure, verify=verify)
     with Run.create("scale", out, settings.as_dict(), inputs) as record:

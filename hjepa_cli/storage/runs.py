@@ -193,8 +193,8 @@ class Run:
                     hint=f"{self.continue_command} {'shows' if finished else 'continues'} it as it "
                     "is; or choose another --out DIR",
                 )
-            further = [flag for flag in ASKED if inputs.get(flag)]
-            further = [flag for flag in further if not recorded["inputs"].get(flag)]
+            done = recorded["inputs"]
+            further = [flag for flag in ASKED if inputs.get(flag) and not done.get(flag)]
             if finished:
                 if further:
                     raise UsageError(
@@ -204,7 +204,7 @@ class Run:
                 self.result = files.read_json(self.path(RESULT))
                 return
             if further:
-                recorded["inputs"] |= dict.fromkeys(further, True)
+                done.update(dict.fromkeys(further, True))
                 files.write_json(self.path(ENVIRONMENT), recorded)
             for name in (METRICS, EVENTS):
                 if self.path(name).exists():  # a kill may have cut the last line
