@@ -184,7 +184,7 @@ def simulate_cell(
     check_count("devices", devices)
     check_count("blocks", blocks)
     chosen = _settings(preset, None, settings)
-    check_schedulable([method], chosen.protocol.steps)
+    check_schedulable([method], chosen.protocol.total_steps)
     kind, protocol, radio = actual_plant(chosen), chosen.protocol, chosen.radio
     how = build_method(method, chosen, model)
     access = Access(

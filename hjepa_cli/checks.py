@@ -11,7 +11,13 @@ from typing import Any
 
 from hjepa_cli import systems
 from hjepa_cli.errors import UsageError
-from hjepa_cli.settings import EncoderSettings, RadioSettings, Settings, dotted
+from hjepa_cli.settings import (
+    EncoderSettings,
+    ProtocolSettings,
+    RadioSettings,
+    Settings,
+    dotted,
+)
 
 # Every method `eval` and `scale` may be asked for; those without a model are skipped.
 METHODS = (
@@ -86,7 +92,10 @@ LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in ran
 LARGEST_STRIDE = 10_000
 # Counts that may be 0, and those of at least two: nothing is learned without a next one.
 FROM_TWO = ("collect.steps", "encoder.batch_frames")
-ZERO_ALLOWED = ("seed", "encoder.shift_px", "hierarchy.shifted_copies", "radio.overhead_bits")
+ZERO_ALLOWED = (
+    *("seed", "encoder.shift_px", "hierarchy.shifted_copies", "radio.overhead_bits"),
+    "protocol.warmup_steps",
+)
 NEGATIVE_ALLOWED = ("encoder.gate_", "radio.power_dbm")  # thresholds of R²; decibels
 POSITIVE = (
     *("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket"),
@@ -161,6 +170,27 @@ def check_methods(methods: tuple[str, ...]) -> None:
     for method in methods:
         if method not in METHODS and not ANY_DEPTH.fullmatch(method):
             raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
+
+
+def check_protocol(protocol: ProtocolSettings) -> None:
+    """Check that what is scored is long enough to say something.
+
+    Raises:
+        UsageError: fewer scored steps than the warm-up has, or than the longest gap.
+    """
+    steps, warmup_steps, longest = protocol.steps, protocol.warmup_steps, protocol.gaps[-1]
+    if steps < warmup_steps:
+        raise UsageError(
+            f"protocol.steps = {steps} are scored after protocol.warmup_steps = {warmup_steps}; "
+            "expected at least as many as the warm-up has",
+            hint=f"--protocol paper, or steps = {warmup_steps} or more in --config FILE.toml",
+        )
+    if longest > steps:
+        raise UsageError(
+            f"protocol.gaps end with {longest} steps, and protocol.steps = {steps} are scored; "
+            "expected gaps no longer than that",
+            hint=f"steps = {longest} or more, or shorter gaps, in --config FILE.toml",
+        )
 
 
 def check_flags_of_law(law: str, given: Mapping[str, bool]) -> None:

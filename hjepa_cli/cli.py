@@ -293,6 +293,7 @@ def train_hierarchy(
 @app.command("eval", rich_help_panel=PIPELINE)
 def evaluate(
     methods: options.Methods = None,
+    protocol: options.Protocol = None,
     process_noise: options.ProcessNoise = None,
     plant_spread: options.PlantSpread = None,
     payload: options.Payload = None,
@@ -322,6 +323,7 @@ def evaluate(
             "seed": seed,
             "device": device,
             "methods": COMPARED if figure and methods is None else options.split_names(methods),
+            "protocol": protocol,
             "protocol.process_noise": process_noise,
             "protocol.plant_spread": plant_spread,
             "protocol.payload": payload,
@@ -367,6 +369,7 @@ def scale(
     coherence_slots: options.CoherenceSlots = None,
     seeds: options.Seeds = None,
     methods: options.Methods = None,
+    protocol: options.Protocol = None,
     process_noise: options.ProcessNoise = None,
     plant_spread: options.PlantSpread = None,
     payload: options.Payload = None,
@@ -396,6 +399,7 @@ def scale(
             "seed": seed,
             "device": device,
             "methods": options.split_names(methods),
+            "protocol": protocol,
             "protocol.process_noise": process_noise,
             "protocol.plant_spread": plant_spread,
             "protocol.payload": payload,

@@ -68,7 +68,10 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         check_count("action_repeat", action_repeat)
         self._pole = CartPole(plant)
         self._kind = self._pole.plant
-        self._protocol = load_settings("gym" if plant == "gym" else None).protocol
+        self._protocol = load_settings(
+            "gym" if plant == "gym" else None,
+            flags={"protocol": "paper"},  # episodes have a start
+        ).protocol
         self._camera = Camera(self._kind)
         self._reward, self._repeat = reward, action_repeat
         self._noise = noise_per_step(self._protocol) * noise

@@ -12,7 +12,7 @@ import typer
 
 from hjepa_cli import completion
 from hjepa_cli.checks import LARGEST_BANDWIDTH_HZ, METHODS, SCHEDULERS
-from hjepa_cli.settings import PLANTS, PRESETS
+from hjepa_cli.settings import PLANTS, PRESETS, PROTOCOLS
 
 FILES, DATA, MODEL, LOOP, RADIO = "Files", "Data", "Model", "Closed loop", "Radio cell"
 SETTINGS, SCREEN = "Settings", "Screen"
@@ -350,6 +350,16 @@ ProcessNoise = Annotated[
         "Noise on the two velocities, or on all four states (the paper).",
         "velocity",
         "isotropic",
+    ),
+]
+Protocol = Annotated[
+    str | None,
+    _one_of(
+        LOOP,
+        "--protocol",
+        "Score the steps after a warm-up, or as the paper from the start on: 1,000 steps of 256 "
+        "devices, for its Fig. 3 and 4. (Without it: steady.)",
+        *PROTOCOLS,
     ),
 ]
 PlantSpread = Annotated[

@@ -277,7 +277,7 @@ def plan_view(
     from hjepa_cli.stages.view import open_viewable
 
     subject = open_viewable(settings, Screen(quiet=True), checkpoint)
-    steps, methods = settings.protocol.steps, settings.methods
+    steps, methods = settings.protocol.total_steps, settings.methods
     frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
     return Plan(
         command="view",
@@ -327,7 +327,7 @@ def _scheduled_work(
         searches *= len(snr_db)
     work = [
         f"simulate up to {MAX_BISECTIONS + 2 * MAX_WIDENINGS} loads of about {BLOCK_DEVICES} "
-        f"devices for {settings.protocol.steps} slots in each of {searches} searches for "
+        f"devices for {settings.protocol.total_steps} slots in each of {searches} searches for "
         f"{len(methods)} methods under {', '.join(radio.schedulers)}"
     ]
     loads = searches * MAX_BISECTIONS  # as a rule
@@ -394,7 +394,7 @@ def _loop_lines(subject: "Subject", methods: list[str], missing: list[str]) -> l
     lines = [f"take the cached curves of {', '.join(known)}"] if known else []
     if missing:
         lines.append(
-            f"drive {options.curve_devices} devices for {options.steps} steps at each of "
+            f"drive {options.curve_devices} devices for {options.total_steps} steps at each of "
             f"{len(options.gaps)} gaps and as many delivery probabilities, "
             f"{options.bracket_devices} near the limit, with {', '.join(missing)}"
         )
@@ -406,7 +406,8 @@ def _loop_seconds(settings: Settings, methods: list[str]) -> float:
     options = settings.protocol
     grids = 2 * len(options.gaps) * options.curve_devices
     searches = 2 * SEARCH_POINTS * options.bracket_devices
-    frames = 2 * options.curve_devices * options.steps * sum(1.0 / gap for gap in options.gaps)
+    per_step = sum(1.0 / gap for gap in options.gaps)
+    frames = 2 * options.curve_devices * options.total_steps * per_step
     pixels = sum(name not in TRUE_STATE for name in methods)
     driving = _drive_seconds(settings, methods, grids + searches)
     return driving + _seconds({"closed-loop frames": pixels * frames})
@@ -414,7 +415,7 @@ def _loop_seconds(settings: Settings, methods: list[str]) -> float:
 
 def _drive_seconds(settings: Settings, methods: list[str], devices: int) -> float:
     """So many devices for all steps, under each of the methods."""
-    device_steps = settings.protocol.steps * devices
+    device_steps = settings.protocol.total_steps * devices
     states = sum(name in TRUE_STATE for name in methods)
     return _seconds(
         {

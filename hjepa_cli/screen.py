@@ -286,6 +286,13 @@ def tolerance(
     return span(entry[f"tolerance_{value_key}"], interval, decimals, bound if censored else "")
 
 
+def described_steps(measured: Mapping[str, Any]) -> str:
+    """Say which steps were scored; results from before there was a warm-up do not know."""
+    if "scored_steps" not in measured:
+        return "scored from the start on"
+    return f"{measured['scored_steps']} steps scored after {measured['warmup_steps']}"
+
+
 def percent(ratio: float | None) -> str:
     """1.38 → ``+38.0 %``."""
     return "unbounded" if ratio is None else f"{100 * (ratio - 1):+.1f} %"

@@ -27,6 +27,7 @@ _SHIPPED = sorted(
 )
 PRESETS = ("default", *(name for name in _SHIPPED if name != "default"))
 PLANTS = ("desktop", "gym", *systems.NAMES)
+PROTOCOLS = ("steady", "paper")  # scored after a warm-up, or from the start on as in the paper
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +148,8 @@ class HierarchySettings:
 class ProtocolSettings:
     """``eval`` and ``scale``: the closed-loop protocol."""
 
-    steps: int
+    warmup_steps: int  # not scored
+    steps: int  # scored
     curve_devices: int
     bracket_devices: int
     start: tuple[float, ...]  # as in [collect]
@@ -172,6 +174,11 @@ class ProtocolSettings:
     def half_widths(self) -> tuple[float, ...]:
         """Of the initial states, one per state."""
         return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
+
+    @property
+    def total_steps(self) -> int:
+        """Steps of a simulation: the warm-up, then those that are scored."""
+        return self.warmup_steps + self.steps
 
     @property
     def velocity_noise(self) -> tuple[float, ...]:
@@ -254,10 +261,13 @@ def load_settings(
     Args:
         preset: one of :data:`PRESETS`; ``None`` is that of the plant, else ``"default"``.
         config: a TOML file of the same shape as the presets.
-        flags: dotted key (``"collect.steps"``) to value; ``None`` values were not given.
+        flags: dotted key (``"collect.steps"``) to value; ``None`` values were not given. The key
+            ``"protocol"`` takes one of :data:`PROTOCOLS`, which sets several values between
+            preset and config file.
 
     Raises:
-        UsageError: unknown preset, key or value of the wrong type, naming the valid choices.
+        UsageError: unknown preset, protocol or key, or a value of the wrong type, naming the valid
+            choices.
         MissingInputError: the config file is not there.
         DataError: the config file is not TOML.
     """
@@ -315,13 +325,20 @@ def _layers(
     """What defines the settings, weakest first: a source and the values it sets."""
     if preset not in PRESETS:
         raise UsageError(f"unknown preset '{preset}'; choose one of {', '.join(PRESETS)}")
+    chosen = flags.get("protocol") or PROTOCOLS[0]
+    if chosen not in PROTOCOLS:
+        raise UsageError(f"unknown protocol {chosen!r}; choose one of {', '.join(PROTOCOLS)}")
     layers = [("default", _read_preset("default"))]
     if preset != "default":
         layers.append((f"preset {preset}", _read_preset(preset)))
+    # What the presets set for the paper's protocol alone is a layer of its own.
+    paper = [values.get("protocol", {}).pop("paper", {}) for _, values in layers]
+    if chosen == "paper":
+        layers += [("protocol paper", {"protocol": values}) for values in paper]
     if config is not None:
         layers.append((str(config), _read_config(config)))
     for key, value in flags.items():
-        if value is not None:
+        if value is not None and key != "protocol":
             section, _, field = key.rpartition(".")
             layers.append(("flag", {section: {field: value}} if section else {field: value}))
     return layers

@@ -118,6 +118,7 @@ def config_show(
     key: options.SettingPrefix = "",
     toml: options.Toml = False,
     methods: options.Methods = None,
+    protocol: options.Protocol = None,
     preset: options.Preset = None,
     config: options.Config = None,
     plant: options.PlantName = None,
@@ -133,6 +134,7 @@ def config_show(
         "seed": seed,
         "device": device,
         "methods": options.split_names(methods),
+        "protocol": protocol,
     }
     settings = resolve(preset, config, flags)
     screen = Screen(quiet, as_json)
@@ -181,6 +183,7 @@ def view(
             "seed": seed,
             "device": device,
             "methods": options.split_names(methods),
+            "protocol": "paper",  # a film begins with the start
             "radio.bandwidth_hz": None if bandwidth_mhz is None else bandwidth_mhz * 1e6,
         },
     )
@@ -258,6 +261,7 @@ def compare(
 
 def reproduce(
     methods: options.Methods = None,
+    protocol: options.Protocol = None,
     out: options.Out = None,
     preset: options.Preset = None,
     config: options.Config = None,
@@ -277,6 +281,7 @@ def reproduce(
         "seed": seed,
         "device": device,
         "methods": options.split_names(methods),
+        "protocol": protocol,
     }
     settings = resolve(preset, config, flags)
     screen = Screen(quiet, as_json)

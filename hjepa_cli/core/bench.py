@@ -8,6 +8,7 @@ import numpy as np
 from hjepa_cli.core import metrics
 from hjepa_cli.core.loop import Outcome, last_states, play
 from hjepa_cli.core.methods import Method
+from hjepa_cli.core.metrics import BESIDE
 from hjepa_cli.core.protocol import KINDS, Curves, Point, Reference, measure_curves
 from hjepa_cli.core.simulator import Runner, Tick, run_points
 from hjepa_cli.core.system import Floats
@@ -17,6 +18,7 @@ EVERY_STEP = Point("gap", 1.0)
 TOLERANCES = (
     *("gap_steps", "gap_ci95", "gap_censored", "gap_lq_steps"),
     *("p", "p_ci95", "p_censored", "p_lq"),
+    *(f"{kind}_{key}" for kind in ("gap", "p") for key in BESIDE),
 )
 
 
@@ -49,7 +51,7 @@ class Bench:
         devices = max(protocol.curve_devices, protocol.bracket_devices)
         teacher = self._at_every_step("optimal", devices)
         few = protocol.curve_devices
-        self._every_step["state"] = Outcome(teacher.score[:, :few], teacher.cost[:, :few])
+        self._every_step["state"] = teacher.part(slice(None), slice(few))
         self.reference = Reference(teacher.score[0], teacher.cost[0], protocol.bootstrap, seed)
         # Now, not after the curves of the first method: every normalised score divides by it.
         metrics.reference_mean(self.reference.score[: min(few, protocol.bracket_devices)])
@@ -78,7 +80,7 @@ class Bench:
     def entry(self, method: Method) -> dict[str, Any]:
         """What ``eval --json`` prints about a method's closed loop."""
         if method.name == "optimal":
-            return _perfect_entry(self.protocol)
+            return _perfect_entry(self.protocol, self.teacher_score) | self._scored
         if not method.uses_link:
             return self._flat_entry(method)
         curves = self.curves(method)
@@ -89,6 +91,11 @@ class Bench:
         }
         gap, delivery = (curves.searches[kind].result() for kind in KINDS)
         lq_gap, lq_delivery = (self._lq_tolerance(kind, described[kind]) for kind in KINDS)
+        there = {
+            f"tolerance_{name}_{key}": value
+            for name, kind, found in (("gap", "gap", gap), ("p", "delivery", delivery))
+            for key, value in _at(found.gap, described[kind] + brackets[kind]).items()
+        }
         return {
             "score": described["gap"][0]["score"],
             "score_ci95": described["gap"][0]["ci95"],
@@ -102,6 +109,8 @@ class Bench:
             "tolerance_p_ci95": [_probability(end) for end in reversed(delivery.interval)],
             "tolerance_p_censored": delivery.censored,
             "tolerance_p_lq": _probability(lq_delivery),
+            **there,
+            **self._scored,
             "gap_curve": described["gap"],
             "gap_bracket": brackets["gap"],
             "delivery_curve": described["delivery"],
@@ -109,6 +118,11 @@ class Bench:
             "n_devices": self.protocol.bracket_devices,
             "n_curve_devices": self.protocol.curve_devices,
         }
+
+    @property
+    def _scored(self) -> dict[str, int]:
+        """What was scored, which tells how many packets a loop at its tolerance really sent."""
+        return {"warmup_steps": self.protocol.warmup_steps, "scored_steps": self.protocol.steps}
 
     def _flat_entry(self, method: Method) -> dict[str, Any]:
         """Of a method without a link: one point measured, which is all of both its curves.
@@ -120,9 +134,7 @@ class Bench:
             method.name, max(protocol.curve_devices, protocol.bracket_devices)
         )
         few = protocol.curve_devices
-        [point] = reference.describe(
-            [EVERY_STEP], Outcome(every.score[:, :few], every.cost[:, :few])
-        )
+        [point] = reference.describe([EVERY_STEP], every.part(slice(None), slice(few)))
         del point["d"]
         low, high = (
             float(end) for end in metrics.interval(reference.score_replicates(every)).ravel()
@@ -149,6 +161,8 @@ class Bench:
             "tolerance_p_ci95": [_probability(end) for end in reversed(ends)],
             "tolerance_p_censored": gap == end,
             "tolerance_p_lq": _probability(lq),
+            **{f"tolerance_{name}_{key}": point[key] for name in ("gap", "p") for key in BESIDE},
+            **self._scored,
             **{
                 f"{kind}_curve": [
                     {**Point(kind, float(gap)).coordinate(), **point} for gap in protocol.gaps
@@ -244,12 +258,14 @@ def control_entry(errors: Floats, every_step: Floats, replicates: int, seed: int
     }
 
 
-def _perfect_entry(protocol: ProtocolSettings) -> dict[str, Any]:
+def _perfect_entry(protocol: ProtocolSettings, teacher_score: float) -> dict[str, Any]:
     """The teacher at every step against itself: 1 wherever it is asked, nothing to tolerate."""
     perfect = {
         "score": 1.0,
         "ci95": [1.0, 1.0],
+        "in_band": teacher_score,
         "lq_ratio": 1.0,
+        "lost": None,
         "n_devices": protocol.curve_devices,
     }
     return {
@@ -268,6 +284,13 @@ def _perfect_entry(protocol: ProtocolSettings) -> dict[str, Any]:
         "n_devices": protocol.bracket_devices,
         "n_curve_devices": protocol.curve_devices,
     }
+
+
+def _at(gap: float, described: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Interpolate what stands beside the score at a mean gap between the points around it."""
+    at = {point["d"] if "d" in point else 1 / point["p"]: point for point in described}
+    gaps = sorted(at)
+    return {key: float(np.interp(gap, gaps, [at[one][key] for one in gaps])) for key in BESIDE}
 
 
 def _probability(gap: float) -> float:

@@ -20,6 +20,7 @@ from hjepa_cli.core.capacity import (
     late_slots,
     slot_capacity,
 )
+from hjepa_cli.core.loop import packets_per_step
 from hjepa_cli.core.metrics import student_interval
 
 Law = Literal["duty", "equal"]
@@ -36,6 +37,7 @@ class Need:
         at_least: the score was still acceptable where the measured range ends; there may be more.
         payload_bits: b.
         delay_steps: how late its packets were when the tolerance was measured.
+        warmup_steps, scored_steps: of the loops that the tolerance was measured on.
     """
 
     method: str
@@ -44,6 +46,8 @@ class Need:
     at_least: bool
     payload_bits: int | None
     delay_steps: int = 0
+    warmup_steps: int = 1
+    scored_steps: int = 1
 
     @classmethod
     def under(cls, law: Law, method: str, entry: Mapping[str, Any]) -> "Need":
@@ -59,7 +63,16 @@ class Need:
             at_least=bool(entry[f"tolerance_{kind}_censored"]),
             payload_bits=entry["bits_per_transmission"],
             delay_steps=delay_steps,
+            warmup_steps=entry["warmup_steps"],
+            scored_steps=entry["scored_steps"],
         )
+
+    def period_as_sent(self, gap_steps: float) -> float:
+        """Mean steps between the packets that a loop with this tolerated gap really sent."""
+        if gap_steps < 1:
+            return gap_steps
+        sent = packets_per_step(gap_steps, self.scored_steps, self.warmup_steps)
+        return float(1 / sent)
 
 
 @dataclass(frozen=True)
@@ -126,14 +139,14 @@ class Cell:
         return int(duty_devices(self._period_slots(need, tolerance, float(c)), c))
 
     def _period_slots(self, need: Need, tolerance: float, c: float) -> float:
-        """Between two packets of a loop that lasts ``tolerance`` slots without one (``duty``)."""
-        if need.delay_steps:  # the tolerance was measured with packets that late
-            return tolerance
-        # A packet that is late on arrival has used up that much of the gap it could have bridged.
-        return max(tolerance - float(late_slots(c)), 0.0)
+        """Mean slots between the packets of a loop that tolerates gaps that long (``duty``)."""
+        if not need.delay_steps:  # else the tolerance was measured with packets that late
+            # A packet that is late on arrival has used up that much of the gap it could bridge.
+            tolerance = max(tolerance - float(late_slots(c)), 0.0)
+        return need.period_as_sent(tolerance)
 
     def _packets_per_slot(self, need: Need, snr_db: float) -> float:
-        """That reach the controller of a loop at its tolerance, where the cell has some."""
+        """Count the packets that reach the controller of a loop at its tolerance, per slot."""
         assert need.tolerance is not None and need.payload_bits is not None
         if self.law == "equal":
             return need.tolerance

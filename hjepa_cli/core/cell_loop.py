@@ -34,17 +34,18 @@ class CellOutcome:
     """What a simulated cell measured.
 
     Attributes:
-        score, cost: means over the steps of each device [N].
-        packets: delivered to each device's controller, without the first [N].
-        reports: innovation reports of all devices.
-        steps: simulated.
+        score, cost: means over the scored steps of each device [N].
+        packets: delivered to each device's controller in the counted slots [N].
+        reports: innovation reports of all devices in the counted slots.
+        counted_slots: the scored steps, but for the first slot of all, in which everybody is heard
+            without asking.
     """
 
     score: Floats
     cost: Floats
     packets: NDArray[np.int64]
     reports: int
-    steps: int
+    counted_slots: int
 
 
 def simulate_cell(
@@ -71,21 +72,27 @@ def simulate_cell(
     Raises:
         NumericalError: the controller returned a force that is not finite.
     """
-    uplink, world = Uplink(access, devices), World(plant, *streamed_draws(protocol, devices, seed))
+    warmup_steps, uplink = protocol.warmup_steps, Uplink(access, devices)
+    world = World(plant, *streamed_draws(protocol, devices, seed), warmup_steps)
     controller: Any = method.controller(devices)
-    outbox, packets, steps = Outbox(), np.zeros(devices, dtype=np.int64), protocol.steps
-    for k in range(steps):
+    outbox, packets, early_reports = Outbox(), np.zeros(devices, dtype=np.int64), 0
+    first_counted = max(warmup_steps, 1)
+    for k in range(protocol.total_steps):
+        if k == first_counted:
+            early_reports = uplink.reports
         uplink.begin()
         if access.levels and k:
             uplink.weigh(controller.apart)
         if uplink.listens:
             _report(uplink, world, controller, method, plant.force_limit_n)
         arrived = uplink.grant()
-        packets += arrived if k else 0
+        packets += arrived if k >= first_counted else 0
         fresh = world.sense(method.sensor, uplink.sampled)
         world.move(controller.act(arrived, outbox.deliver(fresh, uplink.sampled, arrived)))
         tick(devices)
-    return CellOutcome(world.score / steps, world.cost / steps, packets, uplink.reports, steps)
+    score, cost, _ = world.means(protocol.steps)
+    reports, counted_slots = uplink.reports - early_reports, protocol.total_steps - first_counted
+    return CellOutcome(score, cost, packets, reports, counted_slots)
 
 
 class Outbox:
@@ -151,7 +158,7 @@ def _without_packets(
     plant: System, protocol: ProtocolSettings, seed: int, method: Method, devices: int, longest: int
 ) -> tuple[list[int], Floats, Floats]:
     """Ages [G], and of each device then: the force's error and its levels' distance [n, G]."""
-    longest = min(longest, protocol.steps - 1)
+    longest = min(longest, protocol.total_steps - 1)
     wanted = sorted({1, 2, longest, *np.geomspace(4, longest, 20).astype(int).tolist()})
     ages = [age for age in wanted if age <= longest]
     world = World(plant, *streamed_draws(protocol, devices, seed))

@@ -5,7 +5,7 @@ One step k of every loop, in this order:
 1. a device that transmits at k senses its state (its last frames, or the true state) and the
    controller receives the packet, without delay unless it takes longer than a slot;
 2. the controller picks the force u_k, from packets alone;
-3. step k is scored on the state x_k and the force u_k;
+3. step k is scored on the state x_k and the force u_k, once the warm-up is over;
 4. the plant moves to x_{k+1} under u_k and process noise.
 
 Devices N and curve points P (different link schedules on the same draws) share one simulation.
@@ -14,20 +14,23 @@ Devices N and curve points P (different link schedules on the same draws) share 
 import dataclasses
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from hjepa_cli.core.history import LONGEST, frames_seen
+from hjepa_cli.core.metrics import COST_CAP
 from hjepa_cli.core.seeding import generator
 from hjepa_cli.core.system import Bools, Floats, System
 from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.settings import ProtocolSettings
 
-LOOP_VERSION = 4  # raise it whenever a measured number changes: cached curves then expire
+LOOP_VERSION = 5  # raise it whenever a measured number changes: cached curves then expire
 STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
 _DRAWS_KEY = 0xD4A5
+GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples, modulo 1, spread evenly however many are taken
 
 
 class Controller(Protocol):
@@ -66,26 +69,29 @@ class Draws:
         noise: added to the states after each step [steps, N, S].
         delivery: uniform numbers; a packet gets through where they are below p [steps, N].
         mass_scale: two masses of each device (a cart's and its pole's) ÷ nominal [N, 2].
+        warmup_steps: how many of the steps, the first ones, are not scored.
     """
 
     initial: Floats
     noise: Floats
     delivery: Floats
     mass_scale: Floats
+    warmup_steps: int = 0
 
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
         """Draw for ``devices`` devices, all derived from ``seed``."""
         states = len(protocol.half_widths)
         initial = np.empty((devices, states))
-        noise = np.empty((protocol.steps, devices, states))
-        delivery = np.empty((protocol.steps, devices))
+        noise = np.empty((protocol.total_steps, devices, states))
+        delivery = np.empty((protocol.total_steps, devices))
         mass_scale = np.empty((devices, 2))
         for device in range(devices):
             start, scale, uniforms, random = device_draws(protocol, seed, device)
             initial[device], mass_scale[device], delivery[:, device] = start, scale, uniforms
-            noise[:, device] = random.standard_normal((protocol.steps, states))
-        return cls(initial, noise * noise_per_step(protocol), delivery, mass_scale)
+            noise[:, device] = random.standard_normal((protocol.total_steps, states))
+        noise *= noise_per_step(protocol)
+        return cls(initial, noise, delivery, mass_scale, protocol.warmup_steps)
 
     @property
     def devices(self) -> int:
@@ -102,21 +108,22 @@ class Draws:
             self.noise[:, devices],
             self.delivery[:, devices],
             self.mass_scale[devices],
+            self.warmup_steps,
         )
 
 
 def device_draws(
     protocol: ProtocolSettings, seed: int, device: int
 ) -> tuple[Floats, Floats, Floats, np.random.Generator]:
-    """One device's initial state [S], mass factors [2], delivery uniforms [steps], and its stream.
+    """Draw a device's initial state [S], mass factors [2] and delivery uniforms [total steps].
 
-    The stream goes on with the standard normal noise of one step after the other.
+    The stream, returned last, goes on with the standard normal noise of one step after the other.
     """
     half_widths = np.array(protocol.half_widths)
     random = generator(seed, _DRAWS_KEY, device)
     initial = random.uniform(-1, 1, half_widths.size) * half_widths
     mass_scale = 1 + protocol.plant_spread * random.uniform(-1, 1, 2)
-    return initial, mass_scale, random.random(protocol.steps), random
+    return initial, mass_scale, random.random(protocol.total_steps), random
 
 
 def noise_per_step(protocol: ProtocolSettings) -> Floats:
@@ -135,7 +142,10 @@ def every_step(steps: int, devices: int) -> Bools:
 
 
 def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
-    """One packet every D steps: device i sends at 0 and at ⌈nD + φ_i⌉, φ_i = i mod D, n = 0, 1, …
+    """One packet every D steps: device i sends at 0, and at ⌈nD + φ_i⌉ for n = 0, 1, …
+
+    The packet at 0 is one more than the period asks for: :func:`packets_per_step` counts it. The
+    phases φ_i = D · (i · golden ratio mod 1) spread any number of devices evenly over a period.
 
     Args:
         gap_steps: D ≥ 1, whole or fractional, finite.
@@ -148,7 +158,7 @@ def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
     """
     if not 1 <= gap_steps < math.inf:
         raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer, and finite")
-    phases = np.fmod(np.arange(devices), gap_steps)
+    phases = gap_steps * np.fmod(np.arange(devices) * GOLDEN, 1.0)
     periods = np.arange(int(steps / gap_steps) + 1)
     # 1e-9 keeps a sum that is whole up to rounding from being sent one step late.
     times = np.ceil(periods[:, None] * gap_steps + phases - 1e-9).astype(np.int64)
@@ -157,6 +167,21 @@ def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
     schedule[times[period, device], device] = True
     schedule[0] = True
     return schedule
+
+
+def packets_per_step(gap_steps: npt.ArrayLike, scored_steps: int, warmup_steps: int) -> Floats:
+    """Return how many packets a loop under :func:`gap_schedule` sends per scored step.
+
+    It is 1/D in steady state, and 1/D + 1/K where the K scored steps begin with the loop, since
+    everybody is heard once at step 0 whatever its phase.
+
+    Args:
+        gap_steps: D ≥ 1.
+        scored_steps: K.
+        warmup_steps: unscored steps before them.
+    """
+    at_start = 0.0 if warmup_steps else 1.0 / scored_steps
+    return np.minimum(1.0 / np.asarray(gap_steps, np.float64) + at_start, 1.0)
 
 
 def delivery_schedule(probability: float, delivery: Floats) -> Bools:
@@ -181,15 +206,27 @@ def delivery_schedule(probability: float, delivery: Floats) -> Bools:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a simulation measured, averaged over its steps.
+    """What a simulation measured, averaged over its scored steps.
 
     Attributes:
         score: share of steps inside the band [P, N].
         cost: mean capped quadratic cost [P, N].
+        lost: 1 where the loop is :attr:`World.lost` after the last step, else 0 [P, N].
     """
 
     score: Floats
     cost: Floats
+    lost: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence["Outcome"], axis: int) -> "Outcome":
+        """Join outcomes along points (axis 0) or devices (axis 1)."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(*(np.concatenate([getattr(one, name) for one in parts], axis) for name in names))
+
+    def part(self, points: slice, devices: slice = slice(None)) -> "Outcome":
+        """Take some of the points and devices."""
+        return Outcome(*(getattr(self, f.name)[points, devices] for f in dataclasses.fields(self)))
 
 
 def simulate(
@@ -224,7 +261,7 @@ def simulate(
         np.tile(drawn, (points, 1)) for drawn in (draws.initial, draws.mass_scale)
     )
     noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
-    world = World(plant, initial, mass_scale, noise)
+    world = World(plant, initial, mass_scale, noise, draws.warmup_steps)
     nothing = np.zeros(points * devices, dtype=bool), None
     under_way = deque([nothing] * min(delay_steps, steps))
     for k in range(steps):
@@ -232,8 +269,8 @@ def simulate(
         under_way.append((sent, world.sense(sensor, sent)))
         watch(k, states, world.move(controller.act(*under_way.popleft())))
         tick()
-    shape = (points, devices)
-    return Outcome(world.score.reshape(shape) / steps, world.cost.reshape(shape) / steps)
+    means = world.means(steps - draws.warmup_steps)
+    return Outcome(*(values.reshape(points, devices) for values in means))
 
 
 class World:
@@ -244,14 +281,20 @@ class World:
         initial: states at k = -1 [N, S]; the camera needs the frame before k = 0.
         mass_scale: of each device [N, 2].
         noise: added to the states [N, S] after one step after the other.
+        warmup_steps: how many steps go by before scores and costs are summed.
 
     Attributes:
         states: now [N, S].
-        score, cost: sums over the steps so far [N].
+        score, cost: sums over the scored steps so far [N].
     """
 
     def __init__(
-        self, plant: System, initial: Floats, mass_scale: Floats, noise: Iterator[Floats]
+        self,
+        plant: System,
+        initial: Floats,
+        mass_scale: Floats,
+        noise: Iterator[Floats],
+        warmup_steps: int = 0,
     ) -> None:
         devices = len(initial)
         self._plant, self._noise = plant, noise
@@ -261,7 +304,22 @@ class World:
         self._plants.step(plant.no_force(devices))
         self.states = self._plants.states
         self._seen = deque([*switched_on, self.states], maxlen=LONGEST)
-        self.score, self.cost, self._step = np.zeros(devices), np.zeros(devices), 0
+        self.score, self.cost = np.zeros(devices), np.zeros(devices)
+        self._step, self._warmup_steps = 0, warmup_steps
+
+    @property
+    def lost(self) -> Bools:
+        """Whether each loop's state alone costs as much as a step can: a fallen pole [N].
+
+        The stage cost is capped (:data:`~hjepa_cli.core.metrics.COST_CAP`) where control has lost
+        the device; a cart-pole of plant desktop reaches the cap at an angle of 1.58 rad.
+        """
+        at_rest = self._plant.no_force(len(self.states))
+        return np.asarray(self._plant.cost(self.states, at_rest) >= COST_CAP)
+
+    def means(self, scored_steps: int) -> tuple[Floats, Floats, Floats]:
+        """Return score and cost per scored step, and who is lost as 0 or 1 [N] each."""
+        return self.score / scored_steps, self.cost / scored_steps, self.lost.astype(np.float64)
 
     def sense(self, sensor: Sensor, devices: Bools) -> Any:
         """Packets of some devices; ``None`` where there are none."""
@@ -278,8 +336,9 @@ class World:
         if not np.isfinite(forces_n).all():
             raise NumericalError(f"the controller's force is not finite at step {self._step}")
         forces_n = np.clip(forces_n, -self._plant.force_limit_n, self._plant.force_limit_n)
-        self.score += self._plant.in_band(self.states)
-        self.cost += self._plant.cost(self.states, forces_n)
+        if self._step >= self._warmup_steps:
+            self.score += self._plant.in_band(self.states)
+            self.cost += self._plant.cost(self.states, forces_n)
         self._plants.step(forces_n)
         moved = self._plants.states + next(self._noise)
         self._plants.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)

@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 COST_CAP = 50.0
 TAILS = (0.025, 0.975)  # of a 95 % interval
 WINDOWS = ((1, 20), (21, 40), (41, 80), (81, 100))
+BESIDE = ("in_band", "lq_ratio", "lost")  # what a point of a curve has beside its score
 _BOOTSTRAP_KEY = 0xB007
 
 

@@ -83,7 +83,11 @@ class Reference:
         return np.asarray(self.cost[: outcome.cost.shape[1]].mean() / outcome.cost.mean(axis=1))
 
     def describe(self, points: Sequence[Point], outcome: Outcome) -> list[dict[str, Any]]:
-        """Curve entries as printed: coordinate, score, its interval, LQ ratio, devices."""
+        """Return curve entries as printed.
+
+        Each has its coordinate, the normalised score and its interval, the share of steps in the
+        band as it is, the LQ ratio, the share of loops that were lost, and the number of devices.
+        """
         scores = self.relative_score(outcome)
         low, high = metrics.interval(self.score_replicates(outcome))
         costs = self.relative_cost(outcome)
@@ -92,7 +96,9 @@ class Reference:
                 **point.coordinate(),
                 "score": float(scores[i]),
                 "ci95": [float(low[i]), float(high[i])],
+                "in_band": float(outcome.score[i].mean()),
                 "lq_ratio": float(costs[i]),
+                "lost": float(outcome.lost[i].mean()),
                 "n_devices": outcome.score.shape[1],
             }
             for i, point in enumerate(points)
@@ -138,7 +144,7 @@ class Search:
     ) -> None:
         self.kind = kind
         self._grid = dict(zip(map(float, grid), grid_scores.tolist(), strict=True))
-        self._measured: dict[float, tuple[Floats, Floats]] = {}
+        self._measured: dict[float, Outcome] = {}
         self._reference = reference
         self._level, self._bracket = protocol.acceptable_score, protocol.bracket
         self._step_out = 1 + STEP_OUT * protocol.bracket
@@ -153,12 +159,11 @@ class Search:
     @property
     def outcome(self) -> Outcome:
         """Their outcomes [P, N]."""
-        measured = [self._measured[gap] for gap in sorted(self._measured)]
-        return Outcome(*(np.stack(values) for values in zip(*measured, strict=True)))
+        return Outcome.joined([self._measured[gap] for gap in sorted(self._measured)], axis=0)
 
-    def add(self, point: Point, score: Floats, cost: Floats) -> None:
-        """Take the outcome of a wanted point, [N] each."""
-        self._measured[point.gap] = (score, cost)
+    def add(self, point: Point, outcome: Outcome) -> None:
+        """Take the outcome of a point with many devices [1, N]."""
+        self._measured[point.gap] = outcome
 
     def wanted(self) -> list[Point]:
         """The next points to measure with many devices; none when the search is over."""
@@ -222,7 +227,7 @@ class Search:
         if self._rounds > MAX_GUESSES or right / left <= width**2:
             return [self._middle(left, right)]
         guess = self._guess(left, right, scores)
-        if not self._measured:
+        if self._measured.keys() <= self._grid.keys():
             ends = min(self._grid), max(self._grid)
             fan = (guess / self._step_out, guess, guess * self._step_out)
             return sorted({min(max(gap, ends[0]), ends[1]) for gap in fan})
@@ -303,17 +308,16 @@ def measure_curves(
     grid, searches = {}, {}
     for number, kind in enumerate(KINDS):
         rows = slice(number * (len(gaps) - 1), (number + 1) * (len(gaps) - 1))
-        joined = every_step
-        if outcome is not None:
-            joined = Outcome(
-                np.concatenate([every_step.score, outcome.score[rows]]),
-                np.concatenate([every_step.cost, outcome.cost[rows]]),
-            )
-        grid[kind] = ([Point(kind, gap) for gap in gaps], joined)
-        scores = reference.relative_score(joined)
-        searches[kind] = Search(kind, gaps, scores, reference, protocol)
+        parts = [every_step, *([outcome.part(rows)] if outcome else [])]
+        points, joined = [Point(kind, gap) for gap in gaps], Outcome.joined(parts, axis=0)
+        grid[kind] = (points, joined)
+        search = Search(kind, gaps, reference.relative_score(joined), reference, protocol)
+        if protocol.curve_devices == protocol.bracket_devices:  # few devices are many already
+            for row, point in enumerate(points):
+                search.add(point, joined.part(slice(row, row + 1)))
+        searches[kind] = search
     while wanted := [point for search in searches.values() for point in search.wanted()]:
         outcome = measure(wanted, protocol.bracket_devices)
         for row, point in enumerate(wanted):
-            searches[point.kind].add(point, outcome.score[row], outcome.cost[row])
+            searches[point.kind].add(point, outcome.part(slice(row, row + 1)))
     return Curves(grid, searches)

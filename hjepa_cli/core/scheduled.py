@@ -47,17 +47,12 @@ class LoadPoint:
     @property
     def packets_per_slot(self) -> float:
         """Delivered per block and slot."""
-        return float(self.outcome.packets.sum()) / (self.blocks * self._counted_slots)
+        return float(self.outcome.packets.sum()) / (self.blocks * self.outcome.counted_slots)
 
     @property
     def reports_per_slot(self) -> float:
         """Innovation reports per block and slot."""
-        return self.outcome.reports / (self.blocks * self._counted_slots)
-
-    @property
-    def _counted_slots(self) -> int:
-        """All but the first, in which everybody is heard without asking."""
-        return self.outcome.steps - 1
+        return self.outcome.reports / (self.blocks * self.outcome.counted_slots)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -105,7 +105,4 @@ def run_points(
         for start in range(0, devices, size)
     ]
     outcomes = runner(blocks, tick)
-    return Outcome(
-        np.concatenate([outcome.score for outcome in outcomes], axis=1),
-        np.concatenate([outcome.cost for outcome in outcomes], axis=1),
-    )
+    return Outcome.joined(outcomes, axis=1)

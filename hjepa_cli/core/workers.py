@@ -81,7 +81,7 @@ def cluster_runner(executor: Executor, settings: Settings, model: ModelFile | No
             for future, block in zip(futures, blocks, strict=True)
         }
         for future in as_completed(futures):
-            tick(loops[future] * settings.protocol.steps)
+            tick(loops[future] * settings.protocol.total_steps)
 
     return _runner(executor, settings, model, follow)
 

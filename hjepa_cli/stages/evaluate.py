@@ -11,12 +11,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import TRUE_STATE, check_methods, split_late
-from hjepa_cli.core.bench import Bench, control_entry, control_errors, errors_at_every_step
+from hjepa_cli.checks import TRUE_STATE, check_methods, check_protocol, split_late
+from hjepa_cli.core.bench import (
+    Bench,
+    control_entry,
+    control_errors,
+    errors_at_every_step,
+)
 from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
 from hjepa_cli.core.loop import LOOP_VERSION
 from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.metrics import WINDOWS
+from hjepa_cli.core.metrics import BESIDE, WINDOWS
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.simulator import Runner, Simulator
@@ -30,7 +35,7 @@ from hjepa_cli.core.workers import (
     single_thread,
 )
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.screen import Screen, in_order, tolerance
+from hjepa_cli.screen import Screen, described_steps, in_order, tolerance
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
 from hjepa_cli.storage import curves, runs
@@ -103,6 +108,7 @@ def open_measurable(
     Args and errors are those of :func:`run`.
     """
     check_methods(settings.methods)
+    check_protocol(settings.protocol)
     if figure and find_spec("matplotlib") is None:
         raise MissingInputError(
             "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
@@ -259,21 +265,11 @@ def show(result: dict[str, Any], screen: Screen) -> None:
     first = next(iter(entries.values()))
     windows = [f"{start}-{end}" for start, end in WINDOWS]
     where = f"{result['plant']}, seed {result['seed']}"
+    scored = described_steps(first)
     screen.table(
         f"{where}: NMAE by steps since the packet ({first['n_rollouts']} rollouts), score and LQ "
-        f"ratio with every packet ({first['n_curve_devices']} devices), tolerances at score "
-        f"{result['acceptable_score']:g} ({first['n_devices']} devices, 95 % CI) and at LQ ratio "
-        f"{result['acceptable_lq_ratio']:g}",
-        [
-            "method",
-            *(f"NMAE {window}" for window in windows),
-            "score",
-            "LQ",
-            "bits",
-            "gap D* [steps]",
-            "delivery p*",
-            "D* by LQ",
-        ],
+        f"ratio with every packet ({first['n_curve_devices']} devices)",
+        ["method", *(f"NMAE {window}" for window in windows), "score", "LQ", "bits"],
         [
             [
                 name,
@@ -281,8 +277,25 @@ def show(result: dict[str, Any], screen: Screen) -> None:
                 _number(entry["score"], 3),
                 _number(entry["lq_ratio"], 3),
                 entry["bits_per_transmission"],
+            ]
+            for name, entry in entries.items()
+        ],
+    )
+    screen.table(
+        f"{where}: tolerances at score {result['acceptable_score']:g} and, last, at LQ ratio "
+        f"{result['acceptable_lq_ratio']:g} ({first['n_devices']} devices, {scored}, 95 % CI); "
+        "beside each the share of steps in the band, the LQ ratio and the loops lost there",
+        [
+            *("method", "gap D* [steps]", "in band", "LQ", "lost"),
+            *("delivery p*", "in band", "LQ", "lost", "D* by LQ"),
+        ],
+        [
+            [
+                name,
                 tolerance(entry, "gap_steps", "gap", 1, "≥"),
+                *(_number(entry.get(f"tolerance_gap_{key}"), 2) for key in BESIDE),
                 tolerance(entry, "p", "p", 4, "≤"),
+                *(_number(entry.get(f"tolerance_p_{key}"), 2) for key in BESIDE),
                 _number(entry["tolerance_gap_lq_steps"], 1),
             ]
             for name, entry in entries.items()
@@ -398,13 +411,13 @@ def _is_run(directory: Path) -> bool:
 
 def _device_steps(settings: Settings) -> int:
     """Of one curve point with all devices."""
-    return settings.protocol.steps * settings.protocol.bracket_devices
+    return settings.protocol.total_steps * settings.protocol.bracket_devices
 
 
 def _usual_device_steps(settings: Settings) -> int:
     """Of one method: two grids, then rounds of two points."""
     protocol = settings.protocol
-    grids = 2 * len(protocol.gaps) * protocol.curve_devices * protocol.steps
+    grids = 2 * len(protocol.gaps) * protocol.curve_devices * protocol.total_steps
     return grids + 2 * USUAL_ROUNDS * _device_steps(settings)
 
 

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli import __version__, html
+from hjepa_cli.core.metrics import BESIDE
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen, in_order, percent, span, tolerance
+from hjepa_cli.screen import Screen, described_steps, in_order, percent, span, tolerance
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
@@ -234,6 +235,10 @@ def hierarchy_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> l
     ]
 
 
+def _two_decimals(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
 def eval_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
     """Scores and tolerances with their intervals."""
     entries = in_order(result["methods"], config["methods"])
@@ -247,6 +252,7 @@ def eval_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[s
             f"{entry['lq_ratio']:.3f}",
             entry["bits_per_transmission"],
             tolerance(entry, "gap_steps", "gap", 1, "≥"),
+            *(_two_decimals(entry.get(f"tolerance_gap_{key}")) for key in BESIDE),
             tolerance(entry, "p", "p", 4, "≤"),
         ]
         for name, entry in entries.items()
@@ -260,11 +266,17 @@ def eval_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[s
         html.paragraph(
             f"Plant {result['plant']}, seed {result['seed']}, model {result['checkpoint']}. Score "
             f"and LQ ratio with a packet at every step, {first['n_curve_devices']} devices; "
-            f"tolerances from {first['n_devices']} devices. In brackets: 95 % bootstrap intervals."
+            f"tolerances from {first['n_devices']} devices, {described_steps(first)}; beside D* "
+            "the share of steps in the band there, the LQ ratio, and the share of loops lost. In "
+            "brackets: 95 % bootstrap intervals."
         ),
         *_models(result),
         html.table(
-            ["method", "score", "LQ ratio", "bits", "gap D* [steps]", "delivery p*"], tolerances
+            [
+                *("method", "score", "LQ ratio", "bits"),
+                *("gap D* [steps]", "in band", "LQ ratio", "lost", "delivery p*"),
+            ],
+            tolerances,
         ),
         html.paragraph(
             f"Error of the force (NMAE) by steps since a single packet, {first['n_rollouts']} "

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli import plan
-from hjepa_cli.checks import LINKLESS, TRUE_STATE, check_schedulable
+from hjepa_cli.checks import LINKLESS, TRUE_STATE, check_protocol, check_schedulable
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.model import offered
 from hjepa_cli.core.plant import plant
@@ -93,9 +93,10 @@ def check(settings: Settings) -> None:
                 f"law scheduled has nothing to schedule for {', '.join(settings.methods)}",
                 hint="choose --methods that have a link, as hjepa, or radio.law = 'duty'",
             )
-        check_schedulable(linked, settings.protocol.steps)
+        check_schedulable(linked, settings.protocol.total_steps)
     check_stride(max(settings.encoder.h, settings.hierarchy.h), collected.steps)
     check_horizon(settings.protocol.horizon, collected.clean_steps)
+    check_protocol(settings.protocol)
     parse_snr(settings.radio.snr_db)
 
 

@@ -17,7 +17,7 @@ from hjepa_cli.core.cell import Cell, Need, Row, best_flat, gain
 from hjepa_cli.core.methods import FRAME_BITS
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import NumericalError
-from hjepa_cli.screen import Screen, percent, span
+from hjepa_cli.screen import Screen, described_steps, percent, span
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.evaluate import curves_for, measure_points, open_measurable
 from hjepa_cli.stages.subject import Subject
@@ -91,6 +91,8 @@ def run(
             "plant": settings.plant,
             "seed": settings.seed,
             "n_devices": settings.protocol.bracket_devices,
+            "warmup_steps": settings.protocol.warmup_steps,
+            "scored_steps": settings.protocol.steps,
             "acceptable_score": level,
             "law": cell.law,
             "noise": cell.noise,
@@ -252,7 +254,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
 
     screen.table(
         f"one {result['plant']} loop at score {level:g}: seed {result['seed']}, "
-        f"{result['n_devices']} devices, 95 % CI; "
+        f"{result['n_devices']} devices, {described_steps(result)}, 95 % CI; "
         f"limit λ/ln 2 = {result['limit_bits_per_s']:.1f} bit/s",
         ["method", "gap D* [steps]" if duty else "delivery p*", "bits", "bit/s", "÷limit"],
         [

@@ -120,7 +120,7 @@ def open_schedulable(
         MissingInputError: no such checkpoint, or none with any of the methods.
     """
     linked = [name for name in settings.methods if name not in LINKLESS]
-    check_schedulable(linked, settings.protocol.steps)
+    check_schedulable(linked, settings.protocol.total_steps)
     subject = open_subject(settings, screen, checkpoint, None, further)
     methods = subject.measurable(linked)
     if not methods:

@@ -268,7 +268,7 @@ class ScheduledCell:
             outcome = simulate(
                 self._plant,
                 Draws.make(protocol, count, seed),
-                every_step(protocol.steps, count)[None],
+                every_step(protocol.total_steps, count)[None],
                 teacher.controller(count),
                 teacher.sensor,
             )

@@ -157,7 +157,7 @@ def run(
     screen.say(link.label)
     probe = fit_probe(settings, subject.model, screen)
     films = [film(name, settings, subject.model, link, probe, screen) for name in settings.methods]
-    every = every or max(settings.protocol.steps // 100, 1)
+    every = every or max(settings.protocol.total_steps // 100, 1)
     kind = actual_plant(settings)
     pictures = animation.Pictures(films, link, kind, actual_camera(settings), every)
     result = {
@@ -226,7 +226,7 @@ def make_link(
     A packet arrives where the gain |h|² reaches -ln p: then it does with probability p. That is
     the law ``equal`` for as many devices as bring p about.
     """
-    steps, kind = settings.protocol.steps, plant(settings.plant)
+    steps, kind = settings.protocol.total_steps, plant(settings.plant)
     if gap_steps is not None:
         schedule = gap_schedule(gap_steps, steps, devices)
         label = f"a packet every {gap_steps:g} steps, SNR {snr_db:g} dB by power control"

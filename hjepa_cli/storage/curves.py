@@ -279,6 +279,13 @@ _CHECKS: dict[str, Check] = {
     "tolerance_p_ci95": _or_none(_is_interval),
     "tolerance_p_censored": _or_none(_is_flag),
     "bits_per_transmission": lambda value: value is None or value == 0 or _is_count(value),
+    **{
+        f"tolerance_{kind}_{key}": _or_none(_is_number)
+        for kind in ("gap", "p")
+        for key in ("in_band", "lq_ratio", "lost")
+    },
+    "warmup_steps": lambda value: type(value) is int and 0 <= value <= LARGEST,
+    "scored_steps": _is_count,
     "n_devices": _is_count,
     "n_curve_devices": _is_count,
     "n_rollouts": _is_count,
