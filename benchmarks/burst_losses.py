@@ -40,11 +40,11 @@ def main() -> None:
         controller = which.controller(len(schedules) * options.devices)
         return simulate(kind, draws, schedules, controller, which.sensor).score
 
-    everything = every_step(protocol.steps, options.devices)[None]
+    everything = every_step(protocol.total_steps, options.devices)[None]
     reference = scores(everything, build_method("optimal", settings, None))[0]
     weights = bootstrap_weights(options.devices, protocol.bootstrap, seed)
     gaps = np.array([float(gap) for gap in options.gaps.split(",")])
-    print(f"{options.method}, {options.devices} devices, {protocol.steps} steps, seed {seed}")
+    print(f"{options.method}, {options.devices} devices, {protocol.total_steps} steps, seed {seed}")
     for coherence in map(float, options.coherence.split(",")):
         schedules = np.stack([gilbert_elliott(draws.delivery, 1 / g, coherence * g) for g in gaps])
         schedules[:, 0] = True

@@ -46,7 +46,7 @@ def main() -> None:
         for steps, devices in itertools.product(
             map(int, options.steps.split(",")), map(int, options.devices.split(","))
         ):
-            protocol = dataclasses.replace(settings.protocol, steps=steps)
+            protocol = dataclasses.replace(settings.protocol, warmup_steps=0, steps=steps)
             access = Access(
                 scheduler=scheduler,
                 blocks=max(1, devices // options.load),

@@ -70,7 +70,11 @@ def loops(model: Model, settings: Settings, devices: int, steps: int) -> None:
     """The whole loop at a few gaps, in this one process (``eval`` uses one per core)."""
     kind = plant(model.plant_name)
     protocol = dataclasses.replace(
-        settings.protocol, steps=steps, curve_devices=devices, bracket_devices=devices
+        settings.protocol,
+        warmup_steps=0,
+        steps=steps,
+        curve_devices=devices,
+        bracket_devices=devices,
     )
     simulator = Simulator(dataclasses.replace(settings, protocol=protocol), model)
     print(

@@ -74,6 +74,7 @@ SETTINGS = load_settings(
         "hierarchy.flat_steps": 4,
         "hierarchy.medium_steps": 4,
         "hierarchy.low_steps": 4,
+        "protocol": "paper",
         "protocol.steps": 40,
         "protocol.curve_devices": 4,
         "protocol.bracket_devices": 8,

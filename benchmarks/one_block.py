@@ -43,7 +43,7 @@ def main() -> None:
     settings = load_settings()
     kind, protocol = plant(settings.plant), settings.protocol
     if options.slots:
-        protocol = dataclasses.replace(protocol, steps=options.slots)
+        protocol = dataclasses.replace(protocol, warmup_steps=0, steps=options.slots)
     model = Model.load(zoo.resolve_model(options.checkpoint)) if options.checkpoint else None
     method = build_method(options.method, settings, model)
     teacher = build_method("optimal", settings, None)
@@ -59,11 +59,14 @@ def main() -> None:
             (scheduler, weight)
             for weight in (map(float, options.weights.split(",")) if varied else own)
         ]
-    print(f"{options.method}, one block, {protocol.steps} slots, {options.seeds} seeds")
+    print(f"{options.method}, one block, {protocol.total_steps} slots, {options.seeds} seeds")
     for load in map(int, options.loads.split(",")):
         references = []
         for seed in range(options.seeds):
-            draws, always = Draws.make(protocol, load, seed), every_step(protocol.steps, load)[None]
+            draws, always = (
+                Draws.make(protocol, load, seed),
+                every_step(protocol.total_steps, load)[None],
+            )
             found = simulate(kind, draws, always, teacher.controller(load), teacher.sensor)
             references.append(found.score.mean())
         for scheduler, weight in cases:
@@ -84,7 +87,7 @@ def main() -> None:
                 own_score = outcome.score / references[seed]
                 scores.append(own_score.mean())
                 given_up.append(np.mean(own_score < GIVEN_UP))
-                packets.append(outcome.packets.sum() / (protocol.steps - 1))
+                packets.append(outcome.packets.sum() / outcome.counted_slots)
             name = f"{scheduler}, V = {weight:g}" if "drift" in scheduler else scheduler
             print(
                 f"{load} devices, {name}: score {told(scores)}, given up {told(given_up)}, "

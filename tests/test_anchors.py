@@ -137,7 +137,11 @@ def test_the_controller_knows_what_the_actuator_played() -> None:
 
 
 def test_with_exact_states_the_filter_is_the_teacher() -> None:
-    draws = Draws.make(dataclasses.replace(load_settings().protocol, steps=60), 4, seed=1)
+    draws = Draws.make(
+        dataclasses.replace(load_settings(flags={"protocol": "paper"}).protocol, steps=60),
+        4,
+        seed=1,
+    )
     eye = np.eye(4)
     model = LinearGaussian(eye, np.zeros((4, 1)), np.zeros(4), 1e3 * eye, 1e-12 * eye, eye)
     controller = KalmanController(model, np.asarray, teacher("desktop"), 20.0, 4)
@@ -266,7 +270,7 @@ def test_a_reader_of_linear_embeddings_controls_as_well_as_the_teacher(
     reader = kalman.fit_state_reader(model, settings)
     states = 0.05 * np.random.default_rng(0).normal(size=(6, 1, 4))
     assert reader.read(embed(model, states)) == pytest.approx(states[:, 0], abs=1e-3)
-    draws = Draws.make(dataclasses.replace(settings.protocol, steps=200), 6, seed=2)
+    draws = Draws.make(dataclasses.replace(settings.protocol, warmup_steps=0, steps=200), 6, seed=2)
     outcomes = {}
     for gap in (1.0, 20.0):
         controls = KalmanController(reader.filter, reader.read, teacher("desktop"), 20.0, 6)

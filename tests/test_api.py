@@ -17,7 +17,12 @@ from hjepa_cli.core.loop import play
 from hjepa_cli.core.methods import embedding_method
 from hjepa_cli.errors import DataError, UsageError
 
-QUICK = {"protocol.steps": 40, "protocol.curve_devices": 4, "protocol.bracket_devices": 8}
+QUICK = {
+    "protocol": "paper",
+    "protocol.steps": 40,
+    "protocol.curve_devices": 4,
+    "protocol.bracket_devices": 8,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -141,8 +146,12 @@ def test_a_simulated_cell_refuses_what_the_stage_does_not_schedule(model, method
 
 def test_a_simulated_cell_needs_two_slots():
     with pytest.raises(UsageError, match="steps = 1; law scheduled needs at least 2"):
-        hjepa_cli.simulate_cell("hold-true", devices=4, settings={"protocol.steps": 1})
-    two = hjepa_cli.simulate_cell("hold-true", devices=4, settings={"protocol.steps": 2})
+        hjepa_cli.simulate_cell(
+            "hold-true", devices=4, settings={"protocol": "paper", "protocol.steps": 1}
+        )
+    two = hjepa_cli.simulate_cell(
+        "hold-true", devices=4, settings={"protocol": "paper", "protocol.steps": 2}
+    )
     assert two["packets"].sum() <= 1
 
 

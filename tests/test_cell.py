@@ -16,6 +16,8 @@ def entry(gap=100.0, p=0.02, bits=2064, censored=False, spread=0.1):
     around = [1 - spread, 1 + spread]
     return {
         "bits_per_transmission": bits,
+        "warmup_steps": 1000,
+        "scored_steps": 3000,
         "tolerance_gap_steps": gap,
         "tolerance_gap_ci95": None if gap is None else [gap * share for share in around],
         "tolerance_gap_censored": censored,
@@ -51,6 +53,21 @@ def test_bits_of_packets_that_take_several_slots_are_those_of_the_period_that_wa
     assert found["bits_per_s"] == pytest.approx(2064 / ((100 - late) * 1e-3))
     never = row("duty", entry(gap=20.0), bandwidth_hz=1e4)
     assert never["devices"] == 0 and never["bits_per_s"] is never["ratio_to_limit"] is None
+
+
+def test_duty_charges_the_packet_that_everybody_sends_at_the_start():
+    """Scored from the start, a loop with D* = 180.9 sends 6.53 packets in 1,000 steps, not 5.53."""
+    scored_from_the_start = entry(gap=180.9) | {"warmup_steps": 0, "scored_steps": 1000}
+    cell = Cell("duty", "fixed", 20e6, 1e-3, LIMIT_BITS_PER_S)
+    c = 20e6 * 1e-3 / 2064 * math.log2(101)
+    counted = {
+        name: cell.row(Need.under("duty", "hjepa", measured), 20.0)["devices"]
+        for name, measured in (("steady", entry(gap=180.9)), ("start", scored_from_the_start))
+    }
+    assert counted == {
+        "steady": math.floor(c * 180.9),
+        "start": math.floor(c * 1000 / (1000 / 180.9 + 1)),
+    }
 
 
 def test_equal_row_by_hand():

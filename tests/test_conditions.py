@@ -174,12 +174,18 @@ def test_curves_know_of_which_devices_a_dataset_s_clean_rollouts_are(tmp_path) -
 
 
 def test_a_film_is_of_the_devices_that_are_driven() -> None:
-    changes = {"conditions.pole_length": 1.5, "protocol.steps": 40}
+    changes = {"conditions.pole_length": 1.5, "protocol": "paper", "protocol.steps": 40}
     options, model = load_settings(flags=changes), load_model("desktop-h4m2l1")
     link = make_link(options, model, 2, 20.0, 0.05, 4.0)
     probe = torch.zeros(257, 4, dtype=torch.float64)
     shot = film("hold", options, model, link, probe, Screen(quiet=True))
     driven = drive("hold", model=model, gap_steps=4.0, devices=2, settings=changes)
     np.testing.assert_array_equal(shot.states, driven["states"])
-    nominal = drive("hold", model=model, gap_steps=4.0, devices=2, settings={"protocol.steps": 40})
+    nominal = drive(
+        "hold",
+        model=model,
+        gap_steps=4.0,
+        devices=2,
+        settings={"protocol": "paper", "protocol.steps": 40},
+    )
     assert abs(nominal["states"] - shot.states).max() > 0.01

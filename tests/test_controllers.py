@@ -117,7 +117,10 @@ def test_last_force_takes_tensors_of_an_actor() -> None:
 def test_the_oracle_predicts_an_undisturbed_plant() -> None:
     """Without noise it plays, after one packet, what the teacher plays on the true state."""
     quiet = dataclasses.replace(
-        load_settings().protocol, steps=300, noise_x_dot_m_s=0.0, noise_theta_dot_rad_s=0.0
+        load_settings(flags={"protocol": "paper"}).protocol,
+        steps=300,
+        noise_x_dot_m_s=0.0,
+        noise_theta_dot_rad_s=0.0,
     )
     draws = Draws.make(quiet, 5, seed=0)
     method = true_state_method("oracle", DESKTOP, 0)
@@ -221,7 +224,7 @@ def test_no_controller_holds_a_plant(build: Callable[[], dict[str, Controller]])
 @pytest.mark.parametrize("name", [*TRUE_STATE, "stride"])
 def test_forces_follow_from_packets_alone(name: str) -> None:
     """Gusts after the only packet change the plant and not one force."""
-    options = dataclasses.replace(load_settings().protocol, steps=40)
+    options = dataclasses.replace(load_settings(flags={"protocol": "paper"}).protocol, steps=40)
     played = []
     for gusts in (0.0, 20.0):
         draws = Draws.make(options, 2, seed=0)

@@ -55,6 +55,7 @@ def small(
     """All of the protocol, in a few seconds."""
     settings = load_settings("smoke", flags={"seed": seed, "methods": methods})
     tiny = {
+        "warmup_steps": 0,
         "steps": 24,
         "curve_devices": 3,
         "bracket_devices": 4,

@@ -36,6 +36,7 @@ SETTINGS = load_settings(
         "collect.steps": 12,
         "collect.clean_steps": 12,
         "collect.frames": "stored",
+        "protocol": "paper",
         "protocol.steps": 16,
         "protocol.curve_devices": 4,
         "protocol.bracket_devices": 40,

@@ -84,7 +84,7 @@ def test_a_repeated_action_is_held_and_its_reward_averaged():
 
 def test_the_noise_is_the_protocols():
     """With and without noise the next states differ by draws of the protocol's deviations."""
-    protocol = load_settings().protocol
+    protocol = load_settings(flags={"protocol": "paper"}).protocol
     action = np.zeros(1, np.float32)
     differences = []
     noisy, quiet = (gymnasium.make(IDS[0], noise=flag).unwrapped for flag in (True, False))

@@ -19,6 +19,7 @@ from hjepa_cli.core.loop import (
     gap_schedule,
     last_states,
     noise_per_step,
+    packets_per_step,
     play,
     simulate,
 )
@@ -31,7 +32,9 @@ DESKTOP = plant("desktop")
 
 
 def protocol(**changes: Any) -> ProtocolSettings:
-    return dataclasses.replace(load_settings().protocol, **{"steps": 60, **changes})
+    return dataclasses.replace(
+        load_settings(flags={"protocol": "paper"}).protocol, **{"steps": 60, **changes}
+    )
 
 
 def true_state(seen: np.ndarray) -> np.ndarray:
@@ -49,19 +52,55 @@ def true_state(seen: np.ndarray) -> np.ndarray:
 def test_gap_schedule_by_brute_force(gap: Fraction, steps: int, devices: int) -> None:
     schedule = gap_schedule(float(gap), steps, devices)
     for device in range(devices):
-        phase = device % gap  # exact
-        times = {math.ceil(n * gap + phase) for n in range(steps + 1)} | {0}
+        phase = float(gap) * ((device * (math.sqrt(5) - 1) / 2) % 1.0)
+        times = {math.ceil(float(n * gap) + phase - 1e-9) for n in range(steps + 1)} | {0}
         assert np.flatnonzero(schedule[:, device]).tolist() == sorted(t for t in times if t < steps)
 
 
 def test_gap_schedule_of_whole_gaps_spreads_devices_over_phases() -> None:
-    schedule = gap_schedule(4, 40, 8)
-    for device in range(8):
-        later = np.flatnonzero(schedule[1:, device]) + 1
-        assert set(np.diff(later)) == {4}
-        assert later[0] % 4 == device % 4
-    # After the common first packet the load is the same at every step.
-    assert set(schedule[1:].sum(axis=1)) == {2}
+    schedule = gap_schedule(4, 40, 400)
+    for device in range(400):
+        assert set(np.diff(np.flatnonzero(schedule[4:, device]))) == {4}
+    # After the common first packet the load is nearly the same at every step.
+    assert np.abs(schedule[1:].sum(axis=1) - 100).max() <= 2
+
+
+@pytest.mark.parametrize("gap", [1, 7.3, 48.1, 138.2, 180.9, 320])
+@pytest.mark.parametrize(("warmup", "steps", "devices"), [(1000, 3000, 64), (0, 1000, 256)])
+def test_packets_are_counted_as_a_loop_sends_them(
+    gap: float, warmup: int, steps: int, devices: int
+) -> None:
+    """In steady state 1/D a step, to 1 %; from the start on the first packet comes on top."""
+    sent = gap_schedule(gap, warmup + steps, devices)[warmup:].mean()
+    assert packets_per_step(gap, steps, warmup) == pytest.approx(sent, rel=0.01)
+
+
+def test_the_warm_up_is_not_scored() -> None:
+    """Scores after a warm-up are those of the same steps of a longer simulation."""
+    options = protocol(steps=100, warmup_steps=200)
+    draws = Draws.make(options, 3, seed=0)
+    assert (draws.steps, draws.warmup_steps) == (300, 200)
+    seen: list[np.ndarray] = []
+    outcome = simulate(
+        DESKTOP,
+        draws,
+        gap_schedule(60, 300, 3)[None],
+        LastForce(DESKTOP.teacher(), 3, keep=True),
+        true_state,
+        watch=lambda k, states, forces_n: seen.append(DESKTOP.in_band(states)),
+    )
+    assert outcome.score[0] == pytest.approx(np.mean(seen[200:], axis=0))
+    assert not np.allclose(outcome.score[0], np.mean(seen, axis=0))
+
+
+def test_loops_that_fell_are_lost() -> None:
+    """Nobody drives: every pole falls past 1.58 rad, where its cost is capped."""
+    draws = Draws.make(protocol(steps=600), 4, seed=0)
+    drive = LastForce(lambda states: 0 * DESKTOP.teacher()(states), 4, keep=True)
+    fallen = simulate(DESKTOP, draws, every_step(600, 4)[None], drive, true_state)
+    held = LastForce(DESKTOP.teacher(), 4, keep=True)
+    upright = simulate(DESKTOP, draws, every_step(600, 4)[None], held, true_state)
+    assert fallen.lost.mean() > 0.5 and not upright.lost.any()
 
 
 def test_fractional_gaps_keep_their_mean() -> None:
@@ -233,7 +272,7 @@ def test_a_packet_of_step_k_carries_the_frames_up_to_k() -> None:
     sent_at = {
         device: [k for k, p in enumerate(recorder.packets) if device in p] for device in (0, 1)
     }
-    assert sent_at == {0: [0, 5, 10], 1: [0, 1, 6, 11]}
+    assert sent_at == {0: [0, 5, 10], 1: [0, 4, 9]}
     for k, packets in enumerate(recorder.packets):
         for device, seen in packets.items():
             expected = [trajectory[max(k - back, -1)][device] for back in (3, 2, 1, 0)]

@@ -12,7 +12,7 @@ from hjepa_cli.core.loop import Draws, Outcome, delivery_schedule, gap_schedule
 from hjepa_cli.core.protocol import KINDS, Curves, Point, Reference, measure_curves
 from hjepa_cli.settings import ProtocolSettings, load_settings
 
-PROTOCOL = dataclasses.replace(load_settings().protocol, bootstrap=300)
+PROTOCOL = dataclasses.replace(load_settings(flags={"protocol": "paper"}).protocol, bootstrap=300)
 GRID = PROTOCOL.gaps
 Curve = Callable[[float], float]
 
@@ -32,17 +32,17 @@ class Fake:
         scores = np.array(
             [self.curve(point.gap) + bias + self.offsets[:devices] for point in points]
         )
-        return Outcome(scores, 1 / np.maximum(scores, 1e-3))
+        return Outcome(scores, 1 / np.maximum(scores, 1e-3), np.zeros_like(scores))
 
     def curves(self, protocol: ProtocolSettings = PROTOCOL) -> Curves:
         ones = np.ones(PROTOCOL.bracket_devices)
         reference = Reference(ones, ones, protocol.bootstrap, seed=0)
-        first = Outcome(*(a[:, : protocol.curve_devices] for a in self._first()))
+        first = self._first().part(slice(None), slice(protocol.curve_devices))
         return measure_curves(self.measure, first, reference, protocol)
 
-    def _first(self) -> tuple[np.ndarray, np.ndarray]:
+    def _first(self) -> Outcome:
         scores = (self.curve(1.0) + self.offsets)[None]
-        return scores, 1 / np.maximum(scores, 1e-3)
+        return Outcome(scores, 1 / np.maximum(scores, 1e-3), np.zeros_like(scores))
 
     def gaps_with_many(self, kind: str) -> list[float]:
         many = PROTOCOL.bracket_devices
@@ -83,7 +83,7 @@ def test_the_final_bracket_is_narrow_and_measured_with_many(tolerance: float) ->
         left = max(gap for gap in gaps if gap <= tolerance * (1 + 1e-9))
         right = min(gap for gap in gaps if gap >= tolerance * (1 - 1e-9))
         assert right / left - 1 <= PROTOCOL.bracket
-        assert len(gaps) <= 6
+        assert len(gaps) <= 7
 
 
 def test_the_grid_is_measured_with_few_and_its_first_point_is_shared() -> None:
@@ -169,7 +169,7 @@ def test_a_wide_interval_takes_few_rounds() -> None:
 
     ones = np.ones(16)
     reference = Reference(ones, ones, protocol.bootstrap, seed=0)
-    first = Outcome(*(values[:, :16] for values in fake._first()))
+    first = fake._first().part(slice(None), slice(16))
     curves = measure_curves(counting, first, reference, protocol)
     found = curves.searches["gap"].result()
     assert found.interval[0] < 2 and found.interval[1] == 320.0
@@ -183,7 +183,9 @@ def test_a_grid_of_one_point_works() -> None:
 
 
 def test_points_know_their_schedule_and_their_name() -> None:
-    options: Any = dataclasses.replace(load_settings().protocol, steps=50)
+    options: Any = dataclasses.replace(
+        load_settings(flags={"protocol": "paper"}).protocol, steps=50
+    )
     draws = Draws.make(options, 4, seed=0)
     gap, delivery = Point("gap", 2.5), Point("delivery", 2.5)
     assert np.array_equal(gap.schedule(draws), gap_schedule(2.5, 50, 4))
@@ -197,10 +199,14 @@ def test_curve_entries_carry_score_interval_and_cost_ratio() -> None:
     teacher, method = random.uniform(0.8, 1, 64), random.uniform(0.4, 0.8, (2, 64))
     reference = Reference(teacher, np.full(64, 2.0), 500, seed=0)
     points = [Point("gap", 1.0), Point("gap", 2.0)]
-    entries = reference.describe(points, Outcome(method, np.full((2, 64), 5.0)))
+    lost = np.zeros((2, 64))
+    lost[1, :16] = 1.0
+    entries = reference.describe(points, Outcome(method, np.full((2, 64), 5.0), lost))
+    assert [entry["lost"] for entry in entries] == [0.0, 0.25]
     for entry, scores, gap in zip(entries, method, (1.0, 2.0), strict=True):
         assert entry["d"] == gap
         assert entry["score"] == pytest.approx(scores.mean() / teacher.mean())
         assert entry["ci95"][0] < entry["score"] < entry["ci95"][1]
+        assert entry["in_band"] == pytest.approx(scores.mean())
         assert entry["lq_ratio"] == pytest.approx(0.4)
         assert entry["n_devices"] == 64

@@ -312,6 +312,7 @@ def test_real_curves_of_the_true_state_methods(tmp_path, monkeypatch):
         flags={
             "methods": ("hold-true", "optimal"),
             "radio.snr_db": "20:20",
+            "protocol": "paper",
             "protocol.steps": 120,
             "protocol.gaps": (1, 40, 80),
         },

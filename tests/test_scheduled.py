@@ -21,7 +21,12 @@ from hjepa_cli.screen import Screen
 from hjepa_cli.settings import load_settings
 from hjepa_cli.stages import report, scale, scheduled, scheduled_cell
 
-SMALL = {"protocol.steps": 150, "protocol.bracket": 0.2, "protocol.bootstrap": 200}
+SMALL = {
+    "protocol": "paper",
+    "protocol.steps": 150,
+    "protocol.bracket": 0.2,
+    "protocol.bootstrap": 200,
+}
 
 
 @pytest.fixture

@@ -21,7 +21,8 @@ def preset_file(name: str) -> dict[str, Any]:
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in values.items():
-        found |= flat(value, f"{key}.") if isinstance(value, dict) else {prefix + key: value}
+        path = prefix + key
+        found |= flat(value, f"{path}.") if isinstance(value, dict) else {path: value}
     return found
 
 
@@ -31,10 +32,31 @@ def test_every_preset_loads_and_says_what_it_is(preset: str) -> None:
     assert settings.preset == preset
     changes = flat(preset_file(preset))
     merged = flat(preset_file("default")) | changes
+    paper = {key: merged.pop(key) for key in list(merged) if key.startswith("protocol.paper.")}
     expected = {key: value for key, value in merged.items() if value != []}
     found = flat(settings.as_dict())
     assert found.pop("preset") == preset
     assert found == expected
+    # The paper's protocol sets its own values over the preset's, and no others.
+    found = flat(load_settings(preset, flags={"protocol": "paper"}).as_dict())
+    expected |= {key.replace(".paper.", "."): value for key, value in paper.items()}
+    assert found == expected | {"preset": preset}
+
+
+def test_a_protocol_lies_between_preset_and_file(tmp_path: Path) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text("[protocol]\nsteps = 500\n")
+    protocol = load_settings(config=config, flags={"protocol": "paper"}).protocol
+    assert (protocol.warmup_steps, protocol.steps, protocol.bracket_devices) == (0, 500, 256)
+    assert protocol.total_steps == 500
+    known = origins(config=config, flags={"protocol": "paper"})
+    assert known["protocol.warmup_steps"] == "protocol paper"
+    assert known["protocol.steps"] == str(config)
+    with pytest.raises(UsageError, match="choose one of steady, paper"):
+        load_settings(flags={"protocol": "papers"})
+    config.write_text("[protocol.paper]\nsteps = 500\n")
+    with pytest.raises(UsageError, match="unknown setting 'paper'"):
+        load_settings(config=config)
 
 
 def test_every_shipped_preset_is_listed() -> None:
@@ -62,7 +84,10 @@ def test_the_defaults_are_those_of_the_papers() -> None:
         5.0,
     )
     protocol = settings.protocol
-    assert protocol.gaps == (1, 2, 5, 10, 20, 40, 80, 120, 160, 240, 320)
+    assert protocol.gaps == (1, 5, 20, 40, 80, 120, 160, 200, 240, 320)
+    assert (protocol.warmup_steps, protocol.steps) == (1000, 3000)
+    paper = load_settings(flags={"protocol": "paper"}).protocol
+    assert (paper.warmup_steps, paper.steps, paper.bracket_devices) == (0, 1000, 256)
     assert protocol.acceptable_score == 0.62 and protocol.acceptable_lq_ratio == 0.5
     assert settings.radio.bandwidth_hz == 20e6 and settings.radio.snr_db == "10:30"
     paper = load_settings("paper")

@@ -123,7 +123,14 @@ def test_fading_delivers_the_share_that_was_asked_for(checkpoint):
 
 def test_a_periodic_link_loses_nothing(checkpoint):
     model = Model.load(checkpoint, "cpu")
-    link = make_link(load_settings(), model, 2, snr_db=10.0, delivery=0.5, gap_steps=80)
+    link = make_link(
+        load_settings(flags={"protocol": "paper"}),
+        model,
+        2,
+        snr_db=10.0,
+        delivery=0.5,
+        gap_steps=80,
+    )
     assert np.flatnonzero(link.delivered[:, 0]).tolist() == list(range(0, 1000, 80))
     assert not link.sends_always and (link.snr_db == 10).all()
 
