@@ -153,7 +153,14 @@ def test_eval_measures_every_method_and_says_what_it_found(
         assert [point["d"] for point in entry["gap_curve"]] == [1, 8]
         assert [point["p"] for point in entry["delivery_curve"]] == [1, 1 / 8]
         for point in entry["gap_curve"] + entry["delivery_curve"]:
-            assert point.keys() - {"d", "p"} == {"score", "ci95", "lq_ratio", "n_devices"}
+            assert point.keys() - {"d", "p"} == {
+                "score",
+                "ci95",
+                "in_band",
+                "lq_ratio",
+                "lost",
+                "n_devices",
+            }
         assert entry["score"] == entry["gap_curve"][0]["score"]
         assert entry["bits_per_transmission"] == (None if name == "optimal" else 2064)
         assert name in output.stdout.getvalue()
