@@ -16,6 +16,7 @@ from typing import Any
 from hjepa_cli.checks import ANCHORS
 from hjepa_cli.core.conditions import altered
 from hjepa_cli.core.loop import LOOP_VERSION
+from hjepa_cli.core.metrics import BESIDE
 from hjepa_cli.core.plant import definition
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.settings import Settings
@@ -133,7 +134,7 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
     if document.get("digest") != digest.as_dict():
         return {}
     for name, entry in document["methods"].items():
-        if reason := flaw(entry):
+        if reason := flaw(entry, complete=True):
             raise _damaged(path, f"method '{name}': {reason}")
     return {
         name: entry
@@ -208,13 +209,18 @@ def _newest_first(*stages: Path) -> list[Path]:
     )
 
 
-def flaw(entry: object) -> str | None:
-    """What keeps an entry from being used, if anything."""
+def flaw(entry: object, *, complete: bool = False) -> str | None:
+    """Say what keeps an entry from being used, if anything.
+
+    Args:
+        entry: of a method, as read from a file.
+        complete: it is of the present version, and must have all that came later too.
+    """
     if not isinstance(entry, dict):
         return "not an object"
     for key, check in (_CHECKS | _LATER).items():
         if key not in entry:
-            if key in _LATER:
+            if key in _LATER and not complete:
                 continue
             return f"'{key}' is missing"
         if not check(entry[key]):
@@ -279,21 +285,21 @@ _CHECKS: dict[str, Check] = {
     "tolerance_p_ci95": _or_none(_is_interval),
     "tolerance_p_censored": _or_none(_is_flag),
     "bits_per_transmission": lambda value: value is None or value == 0 or _is_count(value),
-    **{
-        f"tolerance_{kind}_{key}": _or_none(_is_number)
-        for kind in ("gap", "p")
-        for key in ("in_band", "lq_ratio", "lost")
-    },
-    "warmup_steps": lambda value: type(value) is int and 0 <= value <= LARGEST,
-    "scored_steps": _is_count,
     "n_devices": _is_count,
     "n_curve_devices": _is_count,
     "n_rollouts": _is_count,
 }
 
-_LATER: dict[str, Check] = {  # came after the first curves that are still good
+_LATER: dict[str, Check] = {  # older results of eval are without these
     "nmae_every_step": _is_number,
     "nmae_every_step_ci95": _is_interval,
+    **{
+        f"tolerance_{kind}_{key}": _or_none(_is_number)
+        for kind in ("gap", "p")
+        for key in BESIDE
+    },
+    "warmup_steps": lambda value: type(value) is int and 0 <= value <= LARGEST,
+    "scored_steps": _is_count,
 }
 
 
