@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.core.controllers import Oracle
-from hjepa_cli.core.linear import linearise_teacher
+from hjepa_cli.core.linear import gains_at_rest
 from hjepa_cli.core.loop import STATE_LIMIT, Draws, Sensor, gap_schedule, simulate
 from hjepa_cli.core.metrics import first_crossing, ratio
 from hjepa_cli.core.reflex_controllers import DecayingHold
@@ -75,6 +75,11 @@ class Trial:
         tolerated = float(first_crossing(grid, scores, trial.level, log=False))
         tolerated = float(np.clip(tolerated, grid[min(1, len(grid) - 1)], grid[-1]))
         return dataclasses.replace(trial, gaps=np.maximum(np.array(AROUND) * tolerated, 1.0))
+
+    def first(self, devices: int) -> "Trial":
+        """The same with fewer devices, or as many as there are."""
+        part = slice(min(devices, self.draws.devices))
+        return dataclasses.replace(self, draws=self.draws.part(part), teacher=self.teacher[part])
 
     @property
     def schedules(self) -> Bools:
@@ -159,7 +164,7 @@ def search_law(
     Returns:
         The law, and the factor (``tied``; 1 otherwise, where it is in the gains).
     """
-    gains_n = linearise_teacher(trial.kind)
+    gains_n = gains_at_rest(trial.kind.teacher(), len(trial.kind.state_names))
     factors = 1 if tied else gains_n.size
 
     def law(candidate: Floats) -> tuple[Floats, Floats]:

@@ -4,14 +4,17 @@ While each packet replaces all that was known, whatever a predictor plays is a f
 packet and its age. A reflex learns that function as it is.
 """
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from hjepa_cli.core.actor import SECOND_HIDDEN
 from hjepa_cli.core.symmetry import MirrorLinear, Signs, Twins, embedding_signs, force_signs
+from hjepa_cli.core.system import System
 
 DECAYS = 8  # of the age: e^(−age/τ) for as many τ, from one step to the longest age
 
@@ -87,3 +90,40 @@ class Reflex(nn.Module):
     def act(self, z: Tensor, ages: Tensor, sent: Tensor | None = None) -> Tensor:
         """Forces that can be applied: ``forward`` clipped to ±1."""
         return torch.clamp(self(z, ages, sent), -1.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Decay:
+    """How the force of a packet fades: s e^(−j/τ) at age j.
+
+    Attributes:
+        gain: s.
+        tau_steps: τ.
+    """
+
+    gain: float
+    tau_steps: float
+
+
+def read_decays(metadata: Mapping[str, Any], kind: System) -> dict[str, Decay]:
+    """What a checkpoint's metadata say of ``hold-decay`` and ``hold-decay-linear``.
+
+    Raises:
+        KeyError, TypeError, ValueError: they are not those of a reflex on this plant.
+    """
+    actor = metadata["reflex"]
+    law = actor["law"]
+    rows, forces = law["gains_n"], math.prod(kind.action_shape)
+    if len(rows) != forces or any(len(row) != len(kind.state_names) for row in rows):
+        raise ValueError(f"expected gains of {forces} forces on {len(kind.state_names)} states")
+    numbers = [value for row in rows for value in row]
+    for part in (actor, law):
+        numbers += [part["gain"], part["tau_steps"]]
+        if part["tau_steps"] <= 0:
+            raise ValueError(f"tau_steps = {part['tau_steps']}; expected more than 0")
+    if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
+        raise ValueError("expected finite numbers")
+    return {
+        name: Decay(float(part["gain"]), float(part["tau_steps"]))
+        for name, part in (("hold-decay", actor), ("hold-decay-linear", law))
+    }

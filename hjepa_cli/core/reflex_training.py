@@ -6,10 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hjepa_cli.core.loop import STATE_LIMIT
 from hjepa_cli.core.reflex import Reflex
 from hjepa_cli.core.system import Floats, System
-
-EXPLORATION_KEY = 0x9E
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -18,33 +17,45 @@ class Plans:
 
     Attributes:
         teacher: the teacher's forces ÷ force limit [N, L, *A] at the ages 0 … L − 1.
-        sent: the forces ÷ force limit that were applied [N, L, *A].
+        sent: the forces ÷ force limit that were applied [N, L, *A]; the teacher's where there is
+            no exploration.
     """
 
     teacher: Tensor
     sent: Tensor
 
 
-def follow(kind: System, states: Floats, steps: int, pushes_n: Floats | None = None) -> Plans:
+def follow(
+    kind: System,
+    states: Floats,
+    steps: int,
+    *,
+    sides: Floats | None = None,
+    pushes_n: Floats | None = None,
+) -> Plans:
     """Let the teacher drive on from some states, without noise.
 
     Args:
         kind: the plant.
         states: of the packets [N, S].
         steps: L.
+        sides: factors on the forces [N, F], where pictures show these states mirrored.
         pushes_n: exploration added to the teacher's forces [N, L, *A]; none by default.
     """
     act, limit_n = kind.teacher(), kind.force_limit_n
-    teacher, sent = np.empty((2, len(states), steps, *kind.action_shape), np.float32)
+    teacher = np.empty((len(states), steps, *kind.action_shape), np.float32)
+    sent = teacher if pushes_n is None else np.empty_like(teacher)
+    side = 1.0 if sides is None else sides.reshape(len(states), *kind.action_shape)
     for age in range(steps):
         forces_n = np.clip(act(states), -limit_n, limit_n)
-        teacher[:, age] = forces_n / limit_n
+        teacher[:, age] = side * forces_n / limit_n
         if pushes_n is not None:
             forces_n = np.clip(forces_n + pushes_n[:, age], -limit_n, limit_n)
-        sent[:, age] = forces_n / limit_n
-        # ±50 is where the loop clips states too: a lost pole must not overflow.
-        states = np.clip(kind.advance(states, forces_n), -50.0, 50.0)
-    return Plans(torch.from_numpy(teacher), torch.from_numpy(sent))
+            sent[:, age] = side * forces_n / limit_n
+        # Clipped as in the loop: a lost pole must not overflow.
+        states = np.clip(kind.advance(states, forces_n), -STATE_LIMIT, STATE_LIMIT)
+    taught = torch.from_numpy(teacher)
+    return Plans(taught, taught if pushes_n is None else torch.from_numpy(sent))
 
 
 def pushes(
@@ -62,32 +73,41 @@ def pushes(
     return np.repeat(drawn_n, hold_steps, axis=1)[:, :steps]
 
 
-def reflex_loss(
-    network: Reflex,
-    z: Tensor,
-    plans: Plans,
-    *,
-    packets: int,
-    ages: int,
-    generator: np.random.Generator,
-) -> Tensor:
-    """Mean squared error of forces on random packets at random ages.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drawn:
+    """A batch: rows of packets [B] and the ages [B] at which their forces are asked for."""
+
+    packets: Tensor
+    ages: Tensor
+
+
+def draw(
+    network: Reflex, count: int, packets: int, ages: int, generator: np.random.Generator
+) -> Drawn:
+    """Random packets of ``count``, each at as many random ages as ``ages``, from 0 to the longest.
+
+    B is ``packets`` · ``ages``.
+    """
+    rows = torch.from_numpy(generator.integers(count, size=packets)).repeat_interleave(ages)
+    drawn = generator.integers(network.longest_age + 1, size=packets * ages)
+    return Drawn(rows, torch.from_numpy(drawn))
+
+
+def reflex_loss(network: Reflex, z: Tensor, plans: Plans, drawn: Drawn) -> Tensor:
+    """Mean squared error of the forces of a batch.
 
     Args:
-        z: embeddings of the packets [N, D].
-        plans: what follows them, of at least A + H steps.
-        packets: drawn.
-        ages: drawn for each, from 0 to A.
-        generator: of both.
+        network: what learns.
+        z: embeddings of all packets [N, D].
+        plans: what follows them, A + H steps at least.
+        drawn: the batch.
     """
-    rows = torch.from_numpy(generator.integers(len(z), size=packets)).repeat_interleave(ages)
-    age = torch.from_numpy(generator.integers(network.longest_age + 1, size=packets * ages))
-    ahead = age[:, None] + torch.arange(network.shape[0])
-    labels = plans.teacher[rows[:, None], ahead]
+    rows, ages = drawn.packets, drawn.ages
+    labels = plans.teacher[rows[:, None], ages[:, None] + torch.arange(network.shape[0])]
     sent = None
     if network.sees_forces:
-        past = torch.arange(network.longest_age) < age[:, None]
         sent = plans.sent[rows, : network.longest_age]
-        sent = sent * past.reshape(*past.shape, *[1] * (sent.dim() - 2))
-    forces = network(z[rows], age, sent)
-    return nn.functional.mse_loss(forces.float(), labels)
+        past = torch.arange(network.longest_age) < ages[:, None]
+        sent = (sent * past.reshape(*past.shape, *[1] * (sent.dim() - 2))).to(z.device)
+    forces = network(z[rows.to(z.device)], ages.to(z.device), sent)
+    return nn.functional.mse_loss(forces.float(), labels.to(z.device))
