@@ -179,7 +179,8 @@ class InNewton:
 
     def plan(self, z: torch.Tensor, ages: torch.Tensor, sent_n: torch.Tensor) -> torch.Tensor:
         self.asked += len(z)
-        return 2 * self.network.act(z, ages, sent_n / 2 if self.remembers else None)
+        sent = sent_n.unsqueeze(1) / 2 if self.remembers else None
+        return 2 * self.network.act(z, ages.unsqueeze(1), sent).squeeze(1)
 
 
 def reflex(*, sees_forces: bool = False, forces_at_once: int = 3, **more: Any) -> Reflex:
@@ -216,11 +217,11 @@ def test_a_reflex_is_played_as_it_is_asked(
                 continue
             age = len(since[device])
             begun = age - age % at_once
-            sent = torch.zeros(1, 7, *shape)
+            sent = torch.zeros(1, 1, 7, *shape)
             for step, force_n in enumerate(since[device][:7]):
-                sent[0, step] = torch.as_tensor(force_n) / 2
-            ages = torch.tensor([begun])
-            plan = network.act(packet[None], ages, sent if sees_forces else None)[0]
+                sent[0, 0, step] = torch.as_tensor(force_n) / 2
+            ages = torch.tensor([[begun]])
+            plan = network.act(packet[None], ages, sent if sees_forces else None)[0, 0]
             np.testing.assert_allclose(played[device], 2 * plan[age - begun], atol=1e-6)
             since[device].append(played[device])
 
@@ -229,7 +230,7 @@ def test_a_reflex_is_played_as_it_is_asked(
 @pytest.mark.parametrize("sees_forces", [False, True])
 def test_reflexes_commute_with_the_mirror(mirror: tuple[float, ...], sees_forces: bool) -> None:
     shape, signs = (len(mirror),), torch.tensor(mirror)
-    z, ages, sent = torch.randn(5, 8), torch.arange(5), torch.randn(5, 7, *shape)
+    z, ages, sent = torch.randn(5, 8), torch.arange(10).reshape(5, 2), torch.randn(5, 2, 7, *shape)
     for exact in (True, False):
         network = reflex(
             sees_forces=sees_forces, action_shape=shape, mirror=mirror if exact else None
@@ -274,17 +275,18 @@ def test_plans_with_exploration_answer_the_state_that_the_pushes_lead_to() -> No
 def test_a_loss_asks_for_the_right_forces_and_sees_the_past_alone() -> None:
     network = reflex(sees_forces=True, forces_at_once=1)
     z, forces = torch.randn(3, 8), torch.randn(3, 9)
-    drawn = reflex_training.Drawn(torch.tensor([2, 0]), torch.tensor([4, 7]))
+    drawn = reflex_training.Drawn(torch.tensor([2, 0]), torch.tensor([[4, 1], [7, 0]]))
 
     def loss(sent: torch.Tensor) -> float:
         plans = reflex_training.Plans(forces, sent)
         return reflex_training.reflex_loss(network, z, plans, drawn).item()
 
     sent = torch.randn(3, 9)
-    past = torch.zeros(2, 7)
-    past[0, :4], past[1] = sent[2, :4], sent[0, :7]
-    answer = network(z[[2, 0]], drawn.ages, past)[:, 0]
-    expected = (answer - torch.stack([forces[2, 4], forces[0, 7]])).square().mean()
+    past = torch.zeros(2, 2, 7)
+    past[0, 0, :4], past[0, 1, :1], past[1, 0] = sent[2, :4], sent[2, :1], sent[0, :7]
+    answer = network(z[[2, 0]], drawn.ages, past)[..., 0]
+    labels = torch.stack([forces[2, [4, 1]], forces[0, [7, 0]]])
+    expected = (answer - labels).square().mean()
     assert loss(sent) == pytest.approx(expected.item(), rel=1e-5)
     later = sent.clone()
     later[2, 4:] += 1.0

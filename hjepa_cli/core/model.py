@@ -330,7 +330,8 @@ class Model:
     def law(self, z: Tensor) -> Tensor:
         """As :meth:`actor`, by the law that ``hold-decay-linear`` fades."""
         with self.autocast():
-            return self.force_limit_n * self.networks["law"].act(z).float()  # type: ignore[operator]
+            action: Tensor = self.networks["law"].act(z).float()  # type: ignore[operator]
+            return self.force_limit_n * action
 
     def reaction(self, method: str) -> Reaction:
         """The reflex behind ``chunk`` or ``chunk-forces``."""
@@ -390,6 +391,7 @@ class _Reaction:
 
     def plan(self, z: Tensor, ages: Tensor, sent_n: Tensor) -> Tensor:
         limit_n, device = self._model.force_limit_n, self._model.device
-        sent = (sent_n / limit_n).to(device) if self.remembers else None
+        sent = (sent_n / limit_n).unsqueeze(1).to(device) if self.remembers else None
         with self._model.autocast():
-            return limit_n * self._reflex.act(z.to(device), ages.to(device), sent).float()
+            actions = self._reflex.act(z.to(device), ages.unsqueeze(1).to(device), sent)
+            return limit_n * actions.squeeze(1).float()

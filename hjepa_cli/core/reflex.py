@@ -69,22 +69,24 @@ class Reflex(nn.Module):
             self.output = MirrorLinear(Twins(SECOND_HIDDEN), Signs(signs * forces_at_once))
 
     def forward(self, z: Tensor, ages: Tensor, sent: Tensor | None = None) -> Tensor:
-        """Forces ÷ force limit [n, H, *A] of the ages j … j + H − 1, unclipped.
+        """Forces ÷ force limit [n, J, H, *A] of the ages j … j + H − 1, unclipped.
 
         Args:
             z: the last packets' embeddings [n, D].
-            ages: their ages j in steps [n].
-            sent: forces ÷ force limit [n, A, *A] of the ages 0 … A − 1, zero from j on; only where
-                the network ``sees_forces``.
+            ages: J ages j of each in steps [n, J].
+            sent: forces ÷ force limit [n, J, A, *A] of the ages 0 … A − 1, zero from j on; only
+                where the network ``sees_forces``.
         """
-        inputs = z if sent is None else torch.cat([z, sent.flatten(1)], dim=-1)
+        inputs = z.unsqueeze(1)  # once for all ages
+        if sent is not None:
+            inputs = torch.cat([inputs.expand(-1, ages.shape[1], -1), sent.flatten(2)], dim=-1)
         ages = ages.clamp(max=self.longest_age).unsqueeze(-1).to(z.dtype)
         even = torch.cat([ages / self.longest_age, torch.exp(-ages * self.decay_rates)], dim=-1)
         scale = 1.0 + self.scale(even)
         if self.mirrored:  # a unit and its twin alike: an age is what it is in a mirror
             scale = torch.cat([scale, scale], dim=-1)
         hidden = torch.relu(self.second(torch.relu(self.first(inputs) * scale)))
-        forces: Tensor = self.output(hidden).reshape(len(z), *self.shape)
+        forces: Tensor = self.output(hidden).reshape(*ages.shape[:2], *self.shape)
         return forces
 
     def act(self, z: Tensor, ages: Tensor, sent: Tensor | None = None) -> Tensor:

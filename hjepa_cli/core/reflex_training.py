@@ -75,7 +75,7 @@ def pushes(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Drawn:
-    """A batch: rows of packets [B] and the ages [B] at which their forces are asked for."""
+    """A batch: rows of packets [B], and ages [B, J] at which the forces of each are asked for."""
 
     packets: Tensor
     ages: Tensor
@@ -84,13 +84,10 @@ class Drawn:
 def draw(
     network: Reflex, count: int, packets: int, ages: int, generator: np.random.Generator
 ) -> Drawn:
-    """Random packets of ``count``, each at as many random ages as ``ages``, from 0 to the longest.
-
-    B is ``packets`` · ``ages``.
-    """
-    rows = torch.from_numpy(generator.integers(count, size=packets)).repeat_interleave(ages)
-    drawn = generator.integers(network.longest_age + 1, size=packets * ages)
-    return Drawn(rows, torch.from_numpy(drawn))
+    """Random packets of ``count``, each at some random ages from 0 to the longest."""
+    rows = generator.integers(count, size=packets)
+    drawn = generator.integers(network.longest_age + 1, size=(packets, ages))
+    return Drawn(torch.from_numpy(rows), torch.from_numpy(drawn))
 
 
 def reflex_loss(network: Reflex, z: Tensor, plans: Plans, drawn: Drawn) -> Tensor:
@@ -103,11 +100,12 @@ def reflex_loss(network: Reflex, z: Tensor, plans: Plans, drawn: Drawn) -> Tenso
         drawn: the batch.
     """
     rows, ages = drawn.packets, drawn.ages
-    labels = plans.teacher[rows[:, None], ages[:, None] + torch.arange(network.shape[0])]
+    ahead = ages[..., None] + torch.arange(network.shape[0])
+    labels = plans.teacher[rows[:, None, None], ahead]
     sent = None
     if network.sees_forces:
-        sent = plans.sent[rows, : network.longest_age]
-        past = torch.arange(network.longest_age) < ages[:, None]
-        sent = (sent * past.reshape(*past.shape, *[1] * (sent.dim() - 2))).to(z.device)
+        past = torch.arange(network.longest_age) < ages[..., None]
+        sent = plans.sent[rows, None, : network.longest_age]
+        sent = (sent * past.reshape(*past.shape, *[1] * (sent.dim() - 3))).to(z.device)
     forces = network(z[rows.to(z.device)], ages.to(z.device), sent)
     return nn.functional.mse_loss(forces.float(), labels.to(z.device))
