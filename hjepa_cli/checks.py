@@ -32,6 +32,10 @@ METHODS = (
     "autoencoder-2",
     "hold",
     "zero",
+    "hold-decay",
+    "hold-decay-linear",
+    "chunk",
+    "chunk-forces",
     "hold-true",
     "zero-true",
     "optimal",
@@ -41,6 +45,9 @@ METHODS = (
     "state-48",
     "local",
 )
+
+# Those of train-reflex: functions of the last packet and its age, without a predictor.
+REFLEXES = ("hold-decay", "hold-decay-linear", "chunk", "chunk-forces")
 
 # The paper's Fig. 3, and the ceiling of prediction.
 COMPARED = (

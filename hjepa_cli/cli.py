@@ -290,6 +290,42 @@ def train_hierarchy(
     )
 
 
+@app.command("train-reflex", rich_help_panel=PIPELINE)
+def train_reflex(
+    dataset: options.Dataset = None,
+    checkpoint: options.Checkpoint = None,
+    out: options.Out = None,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    plant: options.PlantName = None,
+    seed: options.Seed = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+    dry_run: options.DryRun = False,
+    debug: options.Debug = False,
+) -> None:
+    """Train rivals of the predictors: what a packet and its age say, without predicting anything.
+
+    Methods hold-decay, hold-decay-linear, chunk and chunk-forces, on a trained model's encoder.
+    """
+    settings = resolve(preset, config, {"plant": plant, "seed": seed, "device": device})
+    screen = Screen(quiet, as_json)
+
+    def stage() -> Result:
+        from hjepa_cli.stages.train_reflex import run
+
+        return run(settings, screen, dataset=dataset, checkpoint=checkpoint, out=out)
+
+    execute(
+        screen,
+        stage,
+        lambda: plan.plan_train_reflex(settings, dataset, checkpoint, out),
+        dry_run=dry_run,
+        product="checkpoint",
+    )
+
+
 @app.command("eval", rich_help_panel=PIPELINE)
 def evaluate(
     methods: options.Methods = None,

@@ -24,6 +24,8 @@ RATES_PER_S = {  # two cores of a server CPU
     "encoder training frames": 500.0,
     "encoded frames": 3_000.0,
     "level training steps": 10.0,
+    "reflex training samples": 80_000.0,
+    "device-steps of searches": 3_000_000.0,
     "closed-loop frames": 3_500.0,
     "device-steps on embeddings": 50_000.0,
     "device-steps on states": 300_000.0,
@@ -142,8 +144,7 @@ def plan_train_hierarchy(
         steps = options.coarse_steps + options.flat_steps
         steps += options.medium_steps + options.low_steps
     parameters = ENCODER_PARAMETERS + (2 if h == m == l else 4) * _predictor(settings, h)
-    views = 1 + (options.shifted_copies if settings.encoder.shift_px else 0)
-    views *= 2 if settings.encoder.mirror == "augment" else 1
+    views = _views(settings)
     return Plan(
         command="train-hierarchy",
         reads=[_dataset(dataset, settings), _encoder(encoder, settings)],
@@ -160,6 +161,46 @@ def plan_train_hierarchy(
                 "rendered frames": frames,
                 "encoded frames": (1 + views) * frames,
                 "level training steps": steps,
+            }
+        ),
+    )
+
+
+def plan_train_reflex(
+    settings: Settings, dataset: Path | None, checkpoint: str | None, out: Path | None
+) -> Plan:
+    """Plan of ``hjepa train-reflex``."""
+    from hjepa_cli.core.decay_fit import AROUND
+    from hjepa_cli.stages.train_reflex import NETWORKS
+
+    options, frames, views = settings.reflex, _frames(settings), _views(settings)
+    samples = len(NETWORKS) * options.steps * options.batch_packets * options.batch_ages
+    plans = len(NETWORKS) * views * settings.collect.trajectories * settings.collect.steps
+    loops = options.search_candidates * options.search_rounds * options.search_devices
+    searched = 2 * loops * len(AROUND) * options.search_steps
+    fitted = 2 * options.fit_candidates * options.fit_rounds * options.fit_devices * len(AROUND)
+    seen = fitted * options.search_steps / settings.protocol.gaps[-1]  # about two packets a gap
+    return Plan(
+        command="train-reflex",
+        reads=[_dataset(dataset, settings), _trained(checkpoint, settings)],
+        work=[
+            f"render and encode about {frames} frames"
+            + f", those for training {views} times" * (views > 1),
+            f"train {len(NETWORKS)} networks for {options.steps} steps of "
+            f"{options.batch_packets} packets at {options.batch_ages} ages",
+            "search a law whose force fades, and fit two decays on embeddings",
+        ],
+        writes=[f"run {_run('train-reflex', out)}"],
+        writes_bytes=8 * ENCODER_PARAMETERS,
+        seconds=5
+        + _seconds(
+            {
+                "rendered frames": frames,
+                "encoded frames": (1 + views) * frames,
+                "reflex training samples": samples,
+                "device-steps of searches": searched + plans * settings.protocol.gaps[-1],
+                "device-steps on states": fitted * options.search_steps,
+                "closed-loop frames": 4 * seen,
             }
         ),
     )
@@ -365,6 +406,12 @@ def _frames(settings: Settings) -> int:
     return (options.trajectories + options.test_trajectories) * (options.steps + 1)
 
 
+def _views(settings: Settings) -> int:
+    """How many times training pictures are encoded: shifted, and mirrored."""
+    views = 1 + (settings.hierarchy.shifted_copies if settings.encoder.shift_px else 0)
+    return views * (2 if settings.encoder.mirror == "augment" else 1)
+
+
 def _predictor(settings: Settings, actions: int) -> int:
     """Parameters of an anchored predictor, the largest kind."""
     inputs = 2 * settings.encoder.embedding + actions + 1
@@ -445,6 +492,15 @@ def _encoder(name: str | None, settings: Settings) -> str:
         return f"encoder {open_encoder(name, settings, Screen(quiet=True)).path}"
     found = _look(lambda: open_encoder(None, settings, Screen(quiet=True)).path)
     return f"encoder {found}" if found else "encoder: none yet (hjepa train-encoder)"
+
+
+def _trained(name: str | None, settings: Settings) -> str:
+    from hjepa_cli.stages.train_reflex import open_model
+
+    if name is not None:
+        return f"model {open_model(name, settings, Screen(quiet=True)).path}"
+    found = _look(lambda: open_model(None, settings, Screen(quiet=True)).path)
+    return f"model {found}" if found else "model: none yet (hjepa train-hierarchy)"
 
 
 def _look(find: Callable[[], Path | None]) -> Path | None:

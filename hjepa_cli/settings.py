@@ -145,6 +145,26 @@ class HierarchySettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class ReflexSettings:
+    """``train-reflex``: what answers a packet by its age, and the search for decaying holds."""
+
+    forces_at_once: int
+    steps: int
+    batch_packets: int
+    batch_ages: int
+    learning_rate: float
+    weight_decay: float
+    gradient_clip: float
+    search_devices: int
+    search_steps: int
+    search_candidates: int
+    search_rounds: int
+    fit_devices: int
+    fit_candidates: int
+    fit_rounds: int
+
+
+@dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
     """``eval`` and ``scale``: the closed-loop protocol."""
 
@@ -236,6 +256,7 @@ class Settings:
     encoder: EncoderSettings
     actor: ActorSettings
     hierarchy: HierarchySettings
+    reflex: ReflexSettings
     protocol: ProtocolSettings
     conditions: ConditionSettings
     radio: RadioSettings

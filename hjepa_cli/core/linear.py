@@ -38,6 +38,13 @@ def linearise(
     return slopes[:, :count], slopes[:, count:]
 
 
+def gains_at_rest(teacher: Callable[[Floats], Floats], states: int) -> Floats:
+    """Gain K [m, S] of the law u = −K x that a teacher [n, S] → [n, *A] follows near rest."""
+    nudges = NUDGE * np.concatenate([np.eye(states), -np.eye(states)])
+    forces_n = teacher(nudges).reshape(2 * states, -1)
+    return np.asarray(((forces_n[states:] - forces_n[:states]) / (2 * NUDGE)).T)
+
+
 def unstable_rate_rad_s(a: Floats, step_s: float) -> float:
     """Sum of the unstable poles' real parts, Σ ln|λ| ÷ step over the eigenvalues |λ| > 1 of A."""
     growth = np.abs(np.linalg.eigvals(a))

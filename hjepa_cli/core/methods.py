@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hjepa_cli.checks import RAW_FRAMES, TRUE_STATE, late, split_late
+from hjepa_cli.checks import RAW_FRAMES, REFLEXES, TRUE_STATE, late, split_late
 from hjepa_cli.core.codecs import Codec, bits_of, build_codec
 from hjepa_cli.core.conditions import actual_camera
 from hjepa_cli.core.controllers import LastForce, Oracle, Planner, StrideController
@@ -25,6 +25,7 @@ from hjepa_cli.core.kalman import KalmanController, fit_state_reader
 from hjepa_cli.core.linear_latent import LinearPlanner, fit_linear_latent
 from hjepa_cli.core.loop import Controller, Sensor
 from hjepa_cli.core.plant import plant
+from hjepa_cli.core.reflex_controllers import DecayingHold, ReflexController
 from hjepa_cli.core.sensors import camera_sensor, embedding_sensor, true_state
 from hjepa_cli.core.system import Camera, System
 from hjepa_cli.errors import DataError, UsageError
@@ -98,6 +99,8 @@ def _build_method(name: str, settings: Settings, model: "Model | None") -> Metho
     if name in ("state-kf", "state-48"):
         return filtered_method(name, model, settings)
     codec = build_codec(payload, model, settings)
+    if name in REFLEXES:
+        return reflex_method(name, model, codec, camera)
     if name == "linear":
         latent = fit_linear_latent(model, settings)
         planner = LinearPlanner(latent, model.actor, model.force_limit_n)
@@ -157,6 +160,21 @@ def embedding_method(
     sensor = embedding_sensor(model, codec, camera)
     two_levels = functools.partial(_two_levels, model) if name == "hjepa" else None
     return Method(name, sensor, build, reactive, codec.bits, "embedding", two_levels=two_levels)
+
+
+def reflex_method(name: str, model: "Model", codec: Codec, camera: Camera | None = None) -> Method:
+    """One of :data:`~hjepa_cli.checks.REFLEXES`; arguments as of :func:`embedding_method`."""
+    shape = model.action_shape
+    build: Callable[[int], Controller]
+    if name in model.decays:
+        decay = model.decays[name]
+        actor = model.law if name == "hold-decay-linear" else model.actor
+        values = actor, decay.gain, decay.tau_steps, model.force_limit_n
+        build = functools.partial(DecayingHold, *values, action_shape=shape)
+    else:
+        build = functools.partial(ReflexController, model.reaction(name), action_shape=shape)
+    sensor = embedding_sensor(model, codec, camera)
+    return Method(name, sensor, build, build, codec.bits, name)
 
 
 def frames_method(name: str, model: "Model", camera: Camera | None = None) -> Method:

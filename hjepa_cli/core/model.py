@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hjepa_cli.checks import ANCHORS
+from hjepa_cli.checks import ANCHORS, REFLEXES
 from hjepa_cli.core.actor import Actor
 from hjepa_cli.core.controllers import Planner
 from hjepa_cli.core.decoder import Decoder
@@ -21,6 +21,8 @@ from hjepa_cli.core.encoder import Encoder
 from hjepa_cli.core.frame_policies import read_frames
 from hjepa_cli.core.hierarchy import Strides, build_predictors, hold, plan_stride
 from hjepa_cli.core.plant import plant
+from hjepa_cli.core.reflex import Decay, Reflex, read_decays
+from hjepa_cli.core.reflex_controllers import Reaction
 from hjepa_cli.core.system import same_camera
 from hjepa_cli.core.training import autocast, compute_dtype, resolve_device
 from hjepa_cli.errors import DataError, UsageError
@@ -28,7 +30,7 @@ from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkp
 
 ENCODE_BATCH = 64  # larger ones fall out of the caches
 CHOICES = {  # of an architecture; its other values are sizes
-    "kind": ("encoder", "hierarchy", "flat", "supervised", "autoencoder"),
+    "kind": ("encoder", "hierarchy", "flat", "supervised", "autoencoder", "reflex"),
     "frame_input": ("difference", "pair"),
     "frames": (2, 4),
     "stride_actions": ("all", "held"),
@@ -57,7 +59,8 @@ def build_modules(
     - ``hierarchy``: Ψ, all levels, the flat baseline and the actor;
     - ``flat``: Ψ, a predictor of stride h, the one of stride 1 and the actor;
     - ``supervised``: Ψ, of κ frames, and the actor;
-    - ``autoencoder``: Ψ, the decoder, a second Ψ that reads what was decoded, and the actor.
+    - ``autoencoder``: Ψ, the decoder, a second Ψ that reads what was decoded, and the actor;
+    - ``reflex``: Ψ, the actor, one of a law that fades, and the reflexes without and with forces.
     """
     kind, embedding = architecture["kind"], architecture["embedding"]
     symmetric = architecture["mirror"] == "exact"
@@ -86,6 +89,22 @@ def build_modules(
     if kind != "encoder":
         hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
         modules["actor"] = Actor(embedding, hidden, dropout, action_shape, mirror)
+    if kind == "reflex":
+        modules["law"] = Actor(embedding, hidden, dropout, action_shape, mirror)
+        for name, forces_at_once in (
+            ("chunk", architecture["forces_at_once"]),
+            # What follows a force that is not the teacher's depends on the next one: one at a time.
+            ("chunk_forces", 1),
+        ):
+            modules[name] = Reflex(
+                embedding,
+                hidden,
+                longest_age=architecture["longest_age"],
+                forces_at_once=forces_at_once,
+                sees_forces=name == "chunk_forces",
+                action_shape=action_shape,
+                mirror=mirror,
+            )
     return modules
 
 
@@ -100,6 +119,8 @@ def offered(architecture: Mapping[str, Any], states: int = 4) -> tuple[str, ...]
     kind, h = architecture["kind"], architecture.get("h")
     if kind == "encoder":
         return ()
+    if kind == "reflex":
+        return REFLEXES
     if kind not in LEVELS:
         return (f"{kind}-{architecture['frames']}",)
     planned = dict.fromkeys((f"ts-jepa-{h}", "ts-jepa-1"))  # once where h is 1
@@ -143,6 +164,13 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
         for name, tensor in planned.items()
     }
     check_tensors(checkpoint, expected)
+    if architecture["kind"] == "reflex":
+        try:
+            read_decays(metadata, kind)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(
+                f"checkpoint {checkpoint.path} does not say how its forces fade: {error}"
+            ) from None
     modules = build_modules(architecture, kind.action_shape, kind.force_signs)
     modules.load_state_dict(
         {name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()}
@@ -237,6 +265,8 @@ class Model:
             self._planners[f"ts-jepa-{self.strides.h}"] = _Flat(self, "high", self.strides.h)
         if "flat" in levels:
             self._planners["ts-jepa-1"] = _Flat(self, "flat", 1)
+        is_reflex = self.architecture["kind"] == "reflex"
+        self.decays: dict[str, Decay] = read_decays(metadata, kind) if is_reflex else {}
 
     @classmethod
     def load(cls, path: Path, device: str = "auto") -> "Model":
@@ -297,6 +327,16 @@ class Model:
             )
         return self._planners[method]
 
+    def law(self, z: Tensor) -> Tensor:
+        """As :meth:`actor`, by the law that ``hold-decay-linear`` fades."""
+        with self.autocast():
+            action: Tensor = self.networks["law"].act(z).float()  # type: ignore[operator]
+            return self.force_limit_n * action
+
+    def reaction(self, method: str) -> Reaction:
+        """The reflex behind ``chunk`` or ``chunk-forces``."""
+        return _Reaction(self, method.replace("-", "_"))
+
     def autocast(self) -> AbstractContextManager[object]:
         """The precision that the networks were trained in."""
         return autocast(self.device, self.precision)
@@ -337,3 +377,21 @@ class _Flat:
         with self._model.autocast():
             actions = hold(self._model._act(z), self.stride)
             return self._model.force_limit_n * actions, self._predictor(z, actions)
+
+
+class _Reaction:
+    """A reflex, in newton."""
+
+    def __init__(self, model: Model, name: str) -> None:
+        reflex = model.networks[name]
+        assert isinstance(reflex, Reflex)
+        self._model, self._reflex = model, reflex
+        self.stride = reflex.shape[0]
+        self.remembers = reflex.longest_age if reflex.sees_forces else 0
+
+    def plan(self, z: Tensor, ages: Tensor, sent_n: Tensor) -> Tensor:
+        limit_n, device = self._model.force_limit_n, self._model.device
+        sent = (sent_n / limit_n).unsqueeze(1).to(device) if self.remembers else None
+        with self._model.autocast():
+            actions = self._reflex.act(z.to(device), ages.unsqueeze(1).to(device), sent)
+            return limit_n * actions.squeeze(1).float()

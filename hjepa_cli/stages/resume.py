@@ -17,7 +17,7 @@ from hjepa_cli.storage.datasets import MANIFEST, load_dataset
 from hjepa_cli.storage.runs import CONFIG, RESULT, read_environment, version_of
 from hjepa_cli.storage.shards import LOG, remove_log
 
-STAGES = ("train-encoder", "train-hierarchy", "eval", "scale", "reproduce")
+STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale", "reproduce")
 
 
 def run(directory: Path, screen: Screen) -> dict[str, Any]:
@@ -58,6 +58,12 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
             settings, screen, dataset=dataset, encoder=encoder, out=directory
         )
     checkpoint, remeasure = _text(_path(inputs, "checkpoint")), bool(inputs.get("remeasure"))
+    if stage == "train-reflex":
+        from hjepa_cli.stages import train_reflex
+
+        return train_reflex.run(
+            settings, screen, dataset=dataset, checkpoint=checkpoint, out=directory
+        )
     if stage == "eval":
         from hjepa_cli.stages import evaluate
 
@@ -110,6 +116,8 @@ def planned(directory: Path) -> plan.Plan:
         whole = plan.plan_train_encoder(settings, dataset, directory)
     elif stage == "train-hierarchy":
         whole = plan.plan_train_hierarchy(settings, dataset, encoder, directory)
+    elif stage == "train-reflex":
+        whole = plan.plan_train_reflex(settings, dataset, checkpoint, directory)
     elif stage == "eval":
         whole = plan.plan_eval(
             settings, checkpoint, dataset, directory, remeasure=remeasure, figure=figure

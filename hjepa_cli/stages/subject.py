@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import ANCHORS, RAW_FRAMES, TRUE_STATE, split_late
+from hjepa_cli.checks import ANCHORS, RAW_FRAMES, REFLEXES, TRUE_STATE, split_late
 from hjepa_cli.core.model import Model, offered
 from hjepa_cli.core.plant import plant, plant_of
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError
@@ -23,7 +23,7 @@ from hjepa_cli.storage.curves import Digest
 from hjepa_cli.storage.datasets import Dataset
 from hjepa_cli.storage.zoo import CURVES_FILE
 
-TRAINING = ("train-encoder", "train-hierarchy")
+TRAINING = ("train-encoder", "train-hierarchy", "train-reflex")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +166,7 @@ def open_subject(
         MissingInputError, DataError: no such file, damaged, or of another plant.
     """
     plant_of(settings)
-    path = zoo.resolve_model(checkpoint) if checkpoint else _default_model(settings, screen)
+    path = zoo.resolve_model(checkpoint) if checkpoint else default_model(settings, screen)
     model = Model.load(path, settings.device) if path else None
     if model and model.plant_name != settings.plant:
         raise DataError(
@@ -188,7 +188,7 @@ def open_subject(
 def how_to_train(method: str, settings: Settings) -> str:
     """The command that trains the model of a method."""
     if method not in RAW_FRAMES:
-        train = "hjepa train-hierarchy"
+        train = "hjepa train-reflex" if method in REFLEXES else "hjepa train-hierarchy"
     else:
         kind, frames = method.split("-")
         train = f"hjepa train-encoder --method {kind}"
@@ -202,7 +202,7 @@ def how_to_train(method: str, settings: Settings) -> str:
     return train
 
 
-def _default_model(settings: Settings, screen: Screen) -> Path | None:
+def default_model(settings: Settings, screen: Screen) -> Path | None:
     """The newest finished run of the plant, one with a hierarchy before one without, or the zoo's.
 
     Of the zoo the model with the settings' strides, if there is one.

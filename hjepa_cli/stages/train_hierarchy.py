@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.random import Generator
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hjepa_cli.core import health, levels
@@ -61,6 +62,7 @@ FLAT_SETTINGS = (  # all that the training of the flat baseline depends on
     "shifted_copies",
 )
 PICTURE_SETTINGS = ("precision", "shift_px", "light_spread", "camera_noise")  # of [encoder]
+REFLEX = ("longest_age", "forces_at_once")  # of an encoder that comes with reflexes
 ARCHITECTURE = (
     *("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual"),
     "mirror",
@@ -271,7 +273,8 @@ def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, A
     """The encoder's architecture with this stage's strides and actor."""
     hierarchy = settings.hierarchy
     levels = {hierarchy.h, hierarchy.m, hierarchy.l}
-    return source.metadata["architecture"] | {
+    begun = source.metadata["architecture"]
+    return {key: value for key, value in begun.items() if key not in REFLEX} | {
         "kind": "hierarchy" if len(levels) > 1 else "flat",
         "h": hierarchy.h,
         "m": hierarchy.m,
@@ -289,19 +292,15 @@ def embed_all(
     In a copy every trajectory is moved sideways by up to ``encoder.shift_px``, and the labels are
     what the teacher does there. With ``flip`` all of these are there in the mirror too.
     """
-    device, kind = resolve_device(settings.device), plant(settings.plant)
-    farthest, count = settings.encoder.shift_px, len(train.frames)
-    copies = settings.hierarchy.shifted_copies if farthest else 0
-    drawn = generator(settings.seed, STREAM, 0).integers(-farthest, farthest + 1, (copies, count))
+    device, kind, count = resolve_device(settings.device), plant(settings.plant), len(train.frames)
     mirror, teach = torch.tensor(kind.mirror), labels_of(train, kind)
     every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
     views = []
-    for mirrored in (False, True) if flip else (False,):
+    for mirrored, shifts_px in views_of(settings, count, flip=flip):
         side = mirror if mirrored else torch.ones_like(mirror)
-        for shifts_px in (np.zeros(count, dtype=np.int64), *drawn):
-            # A mirror image moved right is that of a picture moved left.
-            labels = side * teach(*every, (-shifts_px if mirrored else shifts_px)[:, None])
-            views.append((mirrored, side, shifts_px, labels))
+        # A mirror image moved right is that of a picture moved left.
+        labels = side * teach(*every, (-shifts_px if mirrored else shifts_px)[:, None])
+        views.append((mirrored, side, shifts_px, labels))
     seen = []
     with screen.progress("encode", len(views) * count, "trajectories") as bar:
         for mirrored, side, shifts_px, labels in views:
@@ -316,6 +315,21 @@ def embed_all(
             data = EmbeddedTrajectories(z.to(device), (side * train.actions).to(device))
             seen.append((data, labels))
     return seen
+
+
+def views_of(settings: Settings, count: int, *, flip: bool) -> list[tuple[bool, NDArray[np.int64]]]:
+    """What training sees of ``count`` trajectories: as they are, shifted, and all in the mirror.
+
+    Returns:
+        Of each view whether it is mirrored, and how far right each of its trajectories is [N], px.
+    """
+    farthest = settings.encoder.shift_px
+    copies = settings.hierarchy.shifted_copies if farthest else 0
+    drawn = generator(settings.seed, STREAM, 0).integers(-farthest, farthest + 1, (copies, count))
+    shifts = (np.zeros(count, dtype=np.int64), *drawn)
+    return [
+        (mirrored, moved) for mirrored in ((False, True) if flip else (False,)) for moved in shifts
+    ]
 
 
 @torch.inference_mode()
