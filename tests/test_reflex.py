@@ -63,6 +63,7 @@ TINY = {
     "reflex.fit_devices": 2,
     "reflex.fit_candidates": 2,
     "reflex.fit_rounds": 1,
+    "protocol.warmup_steps": 0,
     "protocol.steps": 12,
     "protocol.gaps": [1, 4, 10],
     "protocol.horizon": 10,
@@ -130,7 +131,7 @@ def test_a_force_that_fades_needs_no_predictor() -> None:
     The gains push towards where the pole falls: u = −K x with negative K.
     """
     kind, gaps, devices, steps = plant("desktop"), (80, 110, 140), 256, 1000
-    options = dataclasses.replace(load_settings().protocol, steps=steps)
+    options = dataclasses.replace(load_settings(flags={"protocol": "paper"}).protocol, steps=steps)
     drawn = Draws.make(options, devices, seed=0)
     draws = dataclasses.replace(drawn, noise=drawn.noise[:steps], delivery=drawn.delivery[:steps])
     law_n = np.array([22.8, 10.2, 58.6, 5.5])
@@ -319,7 +320,7 @@ def test_a_search_finds_the_top_of_a_hill() -> None:
 def test_searches_move_devices_as_the_loop_does(name: str) -> None:
     """Pymunk and the exact equations are not the same to the last bit, so a step may differ."""
     kind = plant(name)
-    options = load_settings(flags={"plant": name}).protocol
+    options = load_settings(flags={"plant": name, "protocol": "paper"}).protocol
     trial = Trial.make(kind, options, devices=3, steps=60, seed=0)
     law_n, taus = gains_at_rest(kind.teacher(), len(kind.state_names)), (4.0, 20.0)
     found = decay_fit.shares_of_laws(trial, np.stack([law_n, 2 * law_n]), np.array(taus))
@@ -339,7 +340,7 @@ def test_searches_move_devices_as_the_loop_does(name: str) -> None:
 
 def test_a_search_beats_the_law_that_it_starts_from() -> None:
     """On other draws than the search's; the teacher's own gains, held, tolerate nothing here."""
-    kind, options = plant("gym"), load_settings("gym").protocol
+    kind, options = plant("gym"), load_settings("gym", flags={"protocol": "paper"}).protocol
     trial = Trial.make(kind, options, devices=8, steps=150, seed=0)
     law, _ = decay_fit.search_law(trial, candidates=24, rounds=4, seed=0)
     other = Trial.make(kind, options, devices=24, steps=150, seed=5)
@@ -511,7 +512,7 @@ def test_a_dry_run_plans_and_writes_nothing(workplace: Path, shell: Shell) -> No
 
 def test_eval_says_how_to_train_what_is_missing(workplace: Path, shell: Shell) -> None:
     (shell.directory / "tiny.toml").write_text(
-        "[protocol]\nsteps = 12\ngaps = [1, 4]\ncurve_devices = 2\nbracket_devices = 2\n"
+        "[protocol]\nwarmup_steps = 0\nsteps = 12\ngaps = [1, 4]\ncurve_devices = 2\nbracket_devices = 2\n"
         "bracket = 0.9\nhorizon = 8\n[collect]\nclean_trajectories = 2\nclean_steps = 9\n"
     )
     outcome = shell(

@@ -39,7 +39,6 @@ class Trial:
         kind: the nominal plant.
         draws: of N devices.
         gaps: between packets [G], in steps.
-        scored: the last steps of a loop, those that count.
         level: the acceptable score ÷ the teacher's.
         teacher: the teacher's share of these steps in the band, with the true state at each step.
     """
@@ -47,7 +46,6 @@ class Trial:
     kind: System
     draws: Draws
     gaps: Floats
-    scored: int
     level: float
     teacher: Floats
 
@@ -61,12 +59,12 @@ class Trial:
             kind: the plant.
             protocol: starts, noise, level and grid; its devices all are nominal here.
             devices: N.
-            steps: that count.
+            steps: that are scored, after the warm-up of the protocol.
             seed: of the settings.
         """
         nominal = dataclasses.replace(protocol, steps=steps, plant_spread=0.0)
         draws = Draws.make(nominal, devices, seed + SEARCH_SEED)
-        teacher = cls(kind, draws, np.ones(1), steps, protocol.acceptable_score, np.ones(devices))
+        teacher = cls(kind, draws, np.ones(1), protocol.acceptable_score, np.ones(devices))
         grid = np.array(protocol.gaps, float)
         trial = dataclasses.replace(
             teacher, gaps=grid, teacher=teacher.shares(_oracle(kind, devices), true_state)[0]
@@ -93,16 +91,7 @@ class Trial:
         ``controller`` drives C · G · N devices.
         """
         schedules = np.tile(self.schedules, (candidates, 1, 1))
-        inside = np.zeros(schedules[:, 0].size)
-        first = self.draws.steps - self.scored
-
-        def watch(k: int, states: Floats, forces_n: Floats) -> None:
-            nonlocal inside
-            if k >= first:
-                inside += self.kind.in_band(states)
-
-        simulate(self.kind, self.draws, schedules, controller, sensor, watch=watch)
-        return inside.reshape(-1, self.draws.devices) / self.scored
+        return simulate(self.kind, self.draws, schedules, controller, sensor).score
 
     def quality(self, shares: Floats) -> Floats:
         """How good candidates are [C], from :meth:`shares`.
@@ -195,20 +184,20 @@ def shares_of_laws(trial: Trial, gains_n: Floats, tau_steps: Floats) -> Floats:
     forces_n = np.zeros((*shape, gains_n.shape[1]))
     action = (*shape, *kind.action_shape)
     kept = np.exp(-1.0 / tau_steps).reshape(count, 1, 1, 1)
-    states = kind.advance(np.broadcast_to(draws.initial, (*shape, draws.initial.shape[1])),
-                          forces_n.reshape(action))  # fmt: skip
+    initial = np.broadcast_to(draws.initial, (*shape, draws.initial.shape[1]))
+    states = kind.advance(initial, forces_n.reshape(action))
     inside = np.zeros(shape)
     for k in range(draws.steps):
         gap, device = np.nonzero(schedules[:, k])
         if len(gap):
             forces_n[:, gap, device] = -np.einsum("cms,cps->cpm", gains_n, states[:, gap, device])
-        if k >= draws.steps - trial.scored:
+        if k >= draws.warmup_steps:
             inside += kind.in_band(states)
         applied_n = np.clip(forces_n, -kind.force_limit_n, kind.force_limit_n)
         states = kind.advance(states, applied_n.reshape(action)) + draws.noise[k]
         states = np.clip(states, -STATE_LIMIT, STATE_LIMIT)
         forces_n *= kept
-    return inside.reshape(-1, draws.devices) / trial.scored
+    return inside.reshape(-1, draws.devices) / (draws.steps - draws.warmup_steps)
 
 
 def fit_decay(
