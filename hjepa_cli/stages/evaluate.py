@@ -7,9 +7,9 @@ all they depend on, and tables. ``scale`` takes the same curves through :func:`c
 import dataclasses
 import os
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future
-from contextlib import closing, contextmanager
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
 from hjepa_cli.core.workers import Workers, open_workers
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.screen import Screen, in_order, tolerance
+from hjepa_cli.screen import Screen, in_order, ticking, tolerance
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
 from hjepa_cli.storage import curves, runs
@@ -265,7 +265,7 @@ def measure_points(
     device_steps = (len(points) + 1) * _device_steps(settings)
     with (
         open_workers(_device_steps(settings)) as workers,
-        _ticking(screen, f"verify {method}", device_steps) as tick,
+        ticking(screen, f"verify {method}", device_steps) as tick,
     ):
         runner = workers.runner(settings, subject.of(method).file)
         bench = Bench(settings.protocol, settings.seed, runner, tick)
@@ -341,7 +341,7 @@ def _measure(
     settings, protocol = subject.settings, subject.settings.protocol
     rollouts = _clean_rollouts(subject)
     with open_workers(_device_steps(settings)) as workers:
-        with _ticking(screen, "eval teacher", _device_steps(settings)) as tick:
+        with ticking(screen, "eval teacher", _device_steps(settings)) as tick:
             runner = workers.runner(settings, subject.file)
             bench = Bench(protocol, settings.seed, runner, tick)
         if bench.teacher_score < MIN_TEACHER_SCORE:
@@ -350,7 +350,7 @@ def _measure(
                 f"gives it {MIN_TEACHER_SCORE}): normalised scores say little"
             )
         label = f"eval {jobs[0].method}" if len(jobs) == 1 else f"eval {len(jobs)} methods"
-        with _ticking(screen, label, len(jobs) * _usual_device_steps(settings)) as tick:
+        with ticking(screen, label, len(jobs) * _usual_device_steps(settings)) as tick:
             bench.tick = tick
             measured = {
                 share: _Measured(share.subject, bench, workers, rollouts)
@@ -446,21 +446,6 @@ def _usual_device_steps(settings: Settings) -> int:
     protocol = settings.protocol
     grids = 2 * len(protocol.gaps) * protocol.curve_devices * protocol.steps
     return grids + 2 * USUAL_ROUNDS * _device_steps(settings)
-
-
-@contextmanager
-def _ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar over device-steps whose number is a guess: it ends full, never overfull."""
-    left = total
-    with screen.progress(label, total, "device-steps") as bar:
-
-        def tick(steps: int) -> None:
-            nonlocal left
-            bar.advance(min(steps, left))
-            left -= min(steps, left)
-
-        yield tick
-        tick(total)
 
 
 def _number(value: float | None, decimals: int) -> str | None:
