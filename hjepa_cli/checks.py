@@ -88,8 +88,6 @@ FLAGS_OF_LAWS = {  # of `scale`; all others mean something under each law
     "--noise": ("equal",),
     "--remeasure": ("duty", "equal"),
     "--dataset": ("duty", "equal"),
-    "--workers": ("duty", "equal"),
-    "--cluster": ("duty", "equal"),
 }
 
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4

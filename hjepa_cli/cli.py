@@ -466,8 +466,6 @@ def scale(
             "--noise": noise is not None,
             "--remeasure": remeasure,
             "--dataset": dataset is not None,
-            "--workers": workers is not None,
-            "--cluster": cluster is not None,
         }
         check_flags_of_law(settings.radio.law, given)
 

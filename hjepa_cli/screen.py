@@ -12,7 +12,7 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
@@ -178,6 +178,21 @@ class Screen:
     @property
     def _results(self) -> TextIO:
         return self._stderr if self.json else self._stdout
+
+
+@contextmanager
+def ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A progress bar over device-steps whose number is a guess: it ends full, never overfull."""
+    left = total
+    with screen.progress(label, total, "device-steps") as bar:
+
+        def tick(steps: int) -> None:
+            nonlocal left
+            bar.advance(min(steps, left))
+            left -= min(steps, left)
+
+        yield tick
+        tick(total)
 
 
 class _Silent:

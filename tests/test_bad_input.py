@@ -176,8 +176,6 @@ def test_a_plan_of_a_figure_refuses_models_of_different_seeds(shell, monkeypatch
         ("duty", ["--noise", "scaled"], "equal"),
         ("scheduled", ["--remeasure"], "duty"),
         ("scheduled", ["--dataset", "data"], "duty"),
-        ("scheduled", ["--workers", "0"], "duty"),
-        ("scheduled", ["--cluster", "local"], "duty"),
     ],
 )
 def test_a_flag_that_the_law_would_ignore_is_refused(shell, law, flags, meant):

@@ -1,6 +1,5 @@
 """``hjepa eval`` end to end on an untrained model, its cache, and the ceilings of the protocol."""
 
-import contextlib
 import dataclasses
 import io
 import json
@@ -8,6 +7,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -21,10 +21,12 @@ import torch
 from hjepa_cli.checks import TRUE_STATE
 from hjepa_cli.core import executors
 from hjepa_cli.core import plant as plant_module
+from hjepa_cli.core import simulator as simulator_module
 from hjepa_cli.core import workers as workers_module
-from hjepa_cli.core.bench import Bench, control_entry, control_errors, errors_at_every_step
+from hjepa_cli.core.bench import Bench, control_entry
 from hjepa_cli.core.camera import Camera
 from hjepa_cli.core.codecs import Integers
+from hjepa_cli.core.control_errors import control_errors, errors_at_every_step
 from hjepa_cli.core.loop import Outcome
 from hjepa_cli.core.methods import build_method, embedding_method, true_state_method
 from hjepa_cli.core.model import Model, build_modules, tensors_of
@@ -33,14 +35,14 @@ from hjepa_cli.core.plant import plant
 from hjepa_cli.core.policy import teacher
 from hjepa_cli.core.protocol import Point
 from hjepa_cli.core.sensors import embedding_sensor
-from hjepa_cli.core.simulator import BLOCK_DEVICES, Block, Simulator, Tick, run_points
-from hjepa_cli.core.workers import ModelFile, open_workers, simulate, single_thread
+from hjepa_cli.core.simulator import BLOCK_LOOPS, Block, Simulator, Tick, run_points, silent
+from hjepa_cli.core.workers import ModelFile, ThisProcess, compute, open_workers
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import evaluate, resume, scale
 from hjepa_cli.stages.train_encoder import describe_architecture
-from hjepa_cli.storage import curves, zoo
+from hjepa_cli.storage import curves, runs, zoo
 from hjepa_cli.storage.checkpoints import save_checkpoint
 from hjepa_cli.storage.runs import Run
 
@@ -365,17 +367,18 @@ def test_remeasure_replaces_damaged_curves_of_the_run_itself() -> None:
     assert again["methods"] == whole["methods"]
 
 
-def test_anchors_are_fitted_in_one_thread_as_workers_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, build = [], evaluate.build_method
+def test_methods_are_built_in_one_thread_as_workers_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anchors are fitted there."""
+    seen, build = [], simulator_module.build_method
 
     def watched(*given: Any) -> Any:
         seen.append(torch.get_num_threads())
         return build(*given)
 
     torch.set_num_threads(2)
-    monkeypatch.setattr(evaluate, "build_method", watched)
+    monkeypatch.setattr(simulator_module, "build_method", watched)
     evaluate.run(small(methods=("hold-true",)), Output().screen)
-    assert seen == [1] and torch.get_num_threads() == 2
+    assert seen == [1, 1] and torch.get_num_threads() == 2  # the teacher, too
 
 
 def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:
@@ -566,26 +569,28 @@ def test_damaged_curves_are_refused_beside_a_model_and_passed_over_elsewhere(
 # --- Blocks and workers -------------------------------------------------------------------------
 
 
-def test_blocks_cover_the_devices_and_do_not_depend_on_the_runner() -> None:
-    devices = 2 * BLOCK_DEVICES + 3
+def test_blocks_cover_the_devices_and_follow_from_the_batch_alone() -> None:
+    devices = BLOCK_LOOPS + 3
     settings = small(bracket_devices=devices, steps=2)
     asked: list[Block] = []
 
-    def runner(blocks: Sequence[Block], tick: Tick) -> list[Outcome]:
+    def runner(blocks: Sequence[Block], tick: Tick) -> Callable[[], list[Outcome]]:
         asked.extend(blocks)
         return Simulator(settings, None)(blocks, tick)
 
     ticks: list[int] = []
     points = [Point("gap", 2.0), Point("delivery", 8.0)]
     outcome = run_points(runner, "oracle", points, devices, ticks.append)
-    cuts = [0, BLOCK_DEVICES, 2 * BLOCK_DEVICES, devices]
+    cuts = [0, devices // 2, devices]
     assert [(block.start, block.stop) for block in asked] == list(pairwise(cuts))
     assert outcome.score.shape == outcome.cost.shape == (2, devices)
     assert sum(ticks) == 2 * devices * 2  # points, devices, steps
     asked.clear()
+    run_points(runner, "oracle", 20 * points[:1], 64, ticks.append)  # 1,280 loops
     run_points(runner, "oracle", points, 64, ticks.append)
-    run_points(runner, "oracle", points, 5, ticks.append)
-    assert [(block.start, block.stop) for block in asked] == [(0, 32), (32, 64), (0, 5)]
+    run_points(runner, "oracle", 3 * BLOCK_LOOPS * points[:1], 2, ticks.append)
+    cuts_of = [(block.start, block.stop) for block in asked]
+    assert cuts_of == [(0, 32), (32, 64), (0, 64), (0, 1), (1, 2)]
 
 
 def test_a_block_of_some_devices_equals_those_among_all() -> None:
@@ -603,19 +608,22 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
     settings = small(steps=8)
     model = Model.load(checkpoint, "cpu")
     ticks: list[int] = []
-    with open_workers(settings, ModelFile(checkpoint, model.digest), 2) as workers:
+    file = ModelFile(checkpoint, model.digest, model)
+    here = ThisProcess().runner(settings, file)
+    with executors.placed(2), open_workers(0) as opened:
+        workers = opened.runner(settings, file)
         for name in ("oracle", "hjepa"):
             points = [Point("gap", 3.0)]
             theirs = run_points(workers, name, points, 4, ticks.append)
-            alone = single_thread(Simulator(settings, model))
-            ours = run_points(alone, name, points, 4, lambda steps: None)
+            ours = run_points(here, name, points, 4, silent)
             assert np.array_equal(theirs.score, ours.score)
             assert np.array_equal(theirs.cost, ours.cost)
         with pytest.raises(UsageError, match="ts-jepa-5"):
             run_points(workers, "ts-jepa-5", points, 4, ticks.append)
         assert run_points(workers, "oracle", points, 4, ticks.append).cost == pytest.approx(
-            run_points(Simulator(settings, model), "oracle", points, 4, ticks.append).cost
+            run_points(Simulator(settings, model), "oracle", points, 4, silent).cost
         )
+    assert sum(ticks) == 4 * 8 * 3  # devices, steps, runs that came to their end
 
 
 def test_a_worker_that_outlives_commands_does_not_drive_an_old_model(tmp_path: Path) -> None:
@@ -625,22 +633,23 @@ def test_a_worker_that_outlives_commands_does_not_drive_an_old_model(tmp_path: P
     for seed in (0, 1):
         untrained(path, seed=seed)
         model = ModelFile(path, Model.load(path, "cpu").digest)
-        costs.append(simulate(settings, model, block).cost)
+        costs.append(compute(Simulator, settings, model, block)[0].cost)
     assert not np.array_equal(*costs)
     with pytest.raises(DataError, match="another model here"):
-        simulate(settings, ModelFile(path, "0" * 64), block)
+        compute(Simulator, settings, ModelFile(path, "0" * 64), block)
 
 
 def test_a_dead_worker_is_reported_and_none_is_left_behind() -> None:
     points = [Point("gap", 3.0)]
-    with open_workers(small(steps=8, bracket_devices=64), None, 2) as workers:
-        run_points(workers, "oracle", points, 64, lambda steps: None)
+    with executors.placed(2), open_workers(0) as opened:
+        workers = opened.runner(small(steps=8, bracket_devices=2 * BLOCK_LOOPS), None)
+        run_points(workers, "oracle", points, 2 * BLOCK_LOOPS, silent)
         processes = multiprocessing.active_children()
         assert len(processes) == 2
         for process in processes:
             process.kill()
         with pytest.raises(NumericalError, match="a worker process died"):
-            run_points(workers, "oracle", points, 64, lambda steps: None)
+            run_points(workers, "oracle", points, 64, silent)
     assert not multiprocessing.active_children()
 
 
@@ -651,7 +660,7 @@ def test_an_interrupt_ends_the_workers_at_once() -> None:
         pytest.raises(KeyboardInterrupt),
         executors.worker_pool(1, executors.prepare_worker) as pool,
     ):
-        pool.submit(workers_module.simulate, small(steps=1_000_000), None, block)
+        pool.submit(compute, Simulator, small(steps=1_000_000), None, block)
         raise KeyboardInterrupt
     assert not multiprocessing.active_children()
     assert time.monotonic() - started < 30
@@ -672,13 +681,13 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         "import dataclasses, multiprocessing, os, signal\n"
         "from hjepa_cli.core import executors, workers\n"
         "from hjepa_cli.core.protocol import Point\n"
-        "from hjepa_cli.core.simulator import Block\n"
+        "from hjepa_cli.core.simulator import Block, Simulator\n"
         "from hjepa_cli.settings import load_settings\n"
         "if __name__ == '__main__':\n"
         "    settings = load_settings(flags={'protocol.bracket_devices': 64})\n"
         "    opened = executors.worker_pool(1, executors.prepare_worker)\n"
         "    block = Block('hold-true', (Point('gap', 3.0),), 0, 64)\n"
-        "    opened.__enter__().submit(workers.simulate, settings, None, block)\n"
+        "    opened.__enter__().submit(workers.compute, Simulator, settings, None, block)\n"
         "    print(multiprocessing.active_children()[0].pid, flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
@@ -697,31 +706,77 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     assert not Path(f"/proc/{worker}").exists()
 
 
-def test_eval_uses_workers_where_they_are_worth_it(
+def test_workers_are_opened_where_they_are_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers_module, "WORTH_WORKERS", 100)
+    for available, unit_steps, asked, count in (
+        (2, 100, None, 2),
+        (64, 100, None, 8),
+        (2, 99, None, 0),
+        (1, 100, None, 0),
+        (1, 1, 3, 3),
+        (64, 100, 0, 0),
+    ):
+        monkeypatch.setattr(workers_module, "cores", lambda available=available: available)
+        with executors.placed(asked), open_workers(unit_steps) as opened:
+            assert opened.count == count
+            assert not multiprocessing.active_children()  # they start with the first unit
+
+
+SEVERAL = small(
+    steps=30,
+    curve_devices=40,
+    bracket_devices=48,
+    gaps=(1, 4, 16),
+    methods=("hjepa", "ts-jepa-4", "hold", "hold-true", "optimal", "oracle"),
+)
+
+
+def test_the_bytes_of_eval_do_not_depend_on_how_many_work(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[ModelFile | None, int]] = []
-    driven = ModelFile(checkpoint.absolute(), Model.load(checkpoint, "cpu").digest)
+    """Several methods are in flight at once, and are ready in any order."""
+    monkeypatch.setattr(simulator_module, "BLOCK_LOOPS", 50)
+    kept = []
+    for count in (0, 1, 3):
+        with executors.placed(count):
+            evaluate.run(
+                SEVERAL, Output().screen, checkpoint=str(checkpoint), out=Path(f"{count}"),
+                remeasure=True,
+            )  # fmt: skip
+        kept.append(Path(f"{count}/curves.json").read_bytes())
+        found = json.loads(Path(f"{count}/result.json").read_text())["methods"]
+        kept.append(json.dumps(found).encode())
+    assert len(set(kept)) == 2
 
-    @contextlib.contextmanager
-    def fake(settings: Settings, model: ModelFile | None, count: int) -> Iterator[Simulator]:
-        asked.append((model, count))
-        yield Simulator(settings, None)
-        asked.append((None, 0))
 
-    monkeypatch.setattr(evaluate, "open_workers", fake)
-    for available, worth, expected in (
-        (2, 24 * 4, [(driven, 2), (None, 0)]),
-        (64, 24 * 4, [(driven, 8), (None, 0)]),
-        (2, 24 * 4 + 1, []),
-        (1, 1, []),
-    ):
-        monkeypatch.setattr(evaluate, "cores", lambda available=available: available)
-        monkeypatch.setattr(evaluate, "WORTH_WORKERS", worth)
-        subject = subject_of(small(), checkpoint)
-        evaluate.measure_points(subject, Output().screen, method="oracle", gaps=[3])
-        assert asked == expected
-        asked.clear()
+def test_an_error_in_one_method_keeps_those_that_are_measured(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So does an interruption: what is in flight is lost, and measured when it is taken up."""
+    entry, out = evaluate._Measured.entry, Path("run")
+    gone = threading.Event()
+
+    def failing(self: Any, name: str) -> Any:
+        if name == "oracle":
+            gone.wait(60)
+            raise NumericalError("the plant has gone")
+        return entry(self, name)
+
+    settings = small(methods=("hold-true", "oracle"))
+    monkeypatch.setattr(evaluate._Measured, "entry", failing)
+    monkeypatch.setattr(runs.Run, "event", lambda *_, **__: gone.set())
+    with executors.placed(2), pytest.raises(NumericalError, match="the plant has gone"):
+        evaluate.run(settings, Output().screen, out=out)
+    assert not multiprocessing.active_children()
+    assert list(json.loads((out / "curves.json").read_text())["methods"]) == ["hold-true"]
+    monkeypatch.undo()
+    monkeypatch.chdir(out.absolute().parent)
+    seen = []
+    monkeypatch.setattr(
+        evaluate._Measured, "entry", lambda self, name: seen.append(name) or entry(self, name)
+    )
+    evaluate.run(settings, Output().screen, out=out)
+    assert seen == ["oracle"]
 
 
 # --- What pixels become -------------------------------------------------------------------------

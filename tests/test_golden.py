@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hjepa_cli.core.bench import control_errors
+from hjepa_cli.core.control_errors import control_errors
 from hjepa_cli.core.loop import LOOP_VERSION
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.model import Model, build_modules

@@ -38,7 +38,7 @@ class Fake:
         ones = np.ones(PROTOCOL.bracket_devices)
         reference = Reference(ones, ones, protocol.bootstrap, seed=0)
         first = self._first().part(slice(None), slice(protocol.curve_devices))
-        return measure_curves(self.measure, first, reference, protocol)
+        return measure_curves(self.measure, lambda: first, reference, protocol)
 
     def _first(self) -> Outcome:
         scores = (self.curve(1.0) + self.offsets)[None]
@@ -170,7 +170,7 @@ def test_a_wide_interval_takes_few_rounds() -> None:
     ones = np.ones(16)
     reference = Reference(ones, ones, protocol.bootstrap, seed=0)
     first = fake._first().part(slice(None), slice(16))
-    curves = measure_curves(counting, first, reference, protocol)
+    curves = measure_curves(counting, lambda: first, reference, protocol)
     found = curves.searches["gap"].result()
     assert found.interval[0] < 2 and found.interval[1] == 320.0
     assert len(batches) <= 12

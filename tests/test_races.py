@@ -15,7 +15,7 @@ from command_line import ENVIRONMENT, Shell, assert_one_line_error, open_shell
 
 from hjepa_cli.core import executors, workers
 from hjepa_cli.core.protocol import Point
-from hjepa_cli.core.simulator import Block
+from hjepa_cli.core.simulator import Block, silent
 from hjepa_cli.errors import NumericalError, StorageError
 from hjepa_cli.settings import load_settings
 from hjepa_cli.storage import files
@@ -156,16 +156,17 @@ def test_a_worker_that_dies_with_the_lock_of_progress_stops_nobody(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The parent would wait for that lock forever."""
-    monkeypatch.setattr(workers, "simulate", die_with_the_lock)
+    monkeypatch.setattr(workers, "compute", die_with_the_lock)
     block = Block("oracle", (Point("gap", 3.0),), 0, 1)
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.alarm(60)
     try:
         with (
             pytest.raises(NumericalError, match="a worker process died"),
-            workers.open_workers(load_settings(), None, 1) as runner,
+            executors.placed(1),
+            workers.open_workers(0) as opened,
         ):
-            runner([block], lambda steps: None)
+            opened.runner(load_settings(), None)([block], silent)()
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)

@@ -512,7 +512,8 @@ def test_a_dry_run_plans_and_writes_nothing(workplace: Path, shell: Shell) -> No
 
 def test_eval_says_how_to_train_what_is_missing(workplace: Path, shell: Shell) -> None:
     (shell.directory / "tiny.toml").write_text(
-        "[protocol]\nwarmup_steps = 0\nsteps = 12\ngaps = [1, 4]\ncurve_devices = 2\nbracket_devices = 2\n"
+        "[protocol]\nwarmup_steps = 0\nsteps = 12\ngaps = [1, 4]\ncurve_devices = 2\n"
+        "bracket_devices = 2\n"
         "bracket = 0.9\nhorizon = 8\n[collect]\nclean_trajectories = 2\nclean_steps = 9\n"
     )
     outcome = shell(

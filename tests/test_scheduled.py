@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 from command_line import assert_one_line_error, open_shell
 
+from hjepa_cli.core import load_simulator
 from hjepa_cli.core import scheduled as core_scheduled
 from hjepa_cli.core.coding import packet_uses
+from hjepa_cli.core.executors import placed
 from hjepa_cli.core.hall import drop_devices
 from hjepa_cli.core.loop import Draws, every_step, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
@@ -124,12 +126,12 @@ def test_reports_carry_the_overhead_of_packets(stage):
 def test_margins_of_a_hall_by_hand(stage, monkeypatch):
     seen = []
 
-    def simulate_cell(*arguments):
+    def simulate_cell(*arguments, **tick):
         seen.append((arguments[3], arguments[4]))
-        return real(*arguments)
+        return real(*arguments, **tick)
 
-    real = scheduled_cell.simulate_cell
-    monkeypatch.setattr(scheduled_cell, "simulate_cell", simulate_cell)
+    real = load_simulator.simulate_cell
+    monkeypatch.setattr(load_simulator, "simulate_cell", simulate_cell)
     stage("zero-true", schedulers=["max-aoi"], topology="hall", snr_db="10,20")
     noise_dbm = -174 + 10 * math.log10(20e6) + 6
     drop = drop_devices("InF-SH", 3.75, 300, 0)
@@ -185,7 +187,7 @@ def test_verify_simulates_both_sides_of_each_load(stage, monkeypatch):
 def test_verify_goes_beyond_the_largest_load_of_a_search(stage, monkeypatch):
     monkeypatch.setattr(scheduled_cell, "VERIFY_AT", (0.7, 1.4))
     for name in ("BLOCK_DEVICES", "MAX_LOAD"):  # of the teacher beside them
-        monkeypatch.setattr(scheduled_cell, name, 10)
+        monkeypatch.setattr(load_simulator, name, 10)
     result = stage("hold-true", schedulers=["round-robin"], verify=True, seeds=2, snr_db="20")
     assert [check["passed"] for check in result["verify"]] == [True, True]
 
@@ -206,6 +208,27 @@ def test_loads_of_two_seeds_are_compared_seed_by_seed(stage):
     low, high = found["ratio_ci95"]
     assert low < min(ratios) <= max(ratios) < high
     assert math.sqrt(low * high) == pytest.approx(math.sqrt(ratios[0] * ratios[1]))
+
+
+def test_the_bytes_do_not_depend_on_how_many_work(tmp_path, monkeypatch):
+    """The other seeds start from what the first one found, whoever is ready first."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(scheduled, "enforce", lambda *_: None)  # 40 steps verify nothing
+    flags = {
+        "radio.law": "scheduled",
+        "radio.schedulers": ["round-robin", "max-aoi"],
+        "radio.seeds": 3,
+        "radio.snr_db": "20",
+        "methods": ["hold-true", "zero-true"],
+    }
+    settings, kept = load_settings(flags={**SMALL, "protocol.steps": 40, **flags}), set()
+    for count in (0, 1, 2):
+        with placed(count):
+            result = scale.run(settings, Screen(True, stdout=io.StringIO()), verify=True)
+        assert [row["devices"] > 0 for row in result["rows"]] == 4 * [True]
+        assert result["verify"]
+        kept.add(json.dumps({key: result[key] for key in ("rows", "gains", "verify")}))
+    assert len(kept) == 1
 
 
 def test_gains_name_the_best_rivals():

@@ -1,16 +1,24 @@
 """The bench that all methods are compared on: one plant, one protocol, one set of draws."""
 
+import copy
+import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from hjepa_cli.core import metrics
-from hjepa_cli.core.loop import Outcome, last_states, play
-from hjepa_cli.core.methods import Method
+from hjepa_cli.core.loop import Outcome
 from hjepa_cli.core.metrics import BESIDE
 from hjepa_cli.core.protocol import KINDS, Curves, Point, Reference, measure_curves
-from hjepa_cli.core.simulator import Runner, Tick, run_points
+from hjepa_cli.core.simulator import (
+    Pending,
+    Runner,
+    Tick,
+    run_points,
+    silent,
+    start_points,
+)
 from hjepa_cli.core.system import Floats
 from hjepa_cli.settings import ProtocolSettings
 
@@ -22,8 +30,23 @@ TOLERANCES = (
 )
 
 
+class Described(Protocol):
+    """What the bench must know of a method; see :class:`~hjepa_cli.core.methods.Method`."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def family(self) -> str: ...
+    @property
+    def uses_link(self) -> bool: ...
+    @property
+    def bits_per_transmission(self) -> int: ...
+
+
 class Bench:
     """Measures methods, and holds what they share: the teacher's run and each family's first point.
+
+    Several threads may measure methods at a time, if the runner serves them.
 
     Args:
         protocol: draws, grid, devices, level.
@@ -43,15 +66,15 @@ class Bench:
         protocol: ProtocolSettings,
         seed: int,
         runner: Runner,
-        tick: Tick = lambda steps: None,
+        tick: Tick = silent,
     ) -> None:
         self.protocol, self.tick = protocol, tick
-        self._runner = runner
-        self._every_step: dict[str, Outcome] = {}
+        self._runner, self._lock = runner, threading.Lock()
         devices = max(protocol.curve_devices, protocol.bracket_devices)
-        teacher = self._at_every_step("optimal", devices)
+        teacher = self._at_every_step("optimal", devices)()
         few = protocol.curve_devices
-        self._every_step["state"] = teacher.part(slice(None), slice(few))
+        first = teacher.part(slice(None), slice(few))
+        self._every_step: dict[str, Pending] = {"state": lambda: first}
         self.reference = Reference(teacher.score[0], teacher.cost[0], protocol.bootstrap, seed)
         # Now, not after the curves of the first method: every normalised score divides by it.
         metrics.reference_mean(self.reference.score[: min(few, protocol.bracket_devices)])
@@ -61,15 +84,23 @@ class Bench:
         """The teacher's own share of steps inside the band; a sound protocol has 0.85 or more."""
         return float(self.reference.score.mean())
 
+    def sharing(self, runner: Runner) -> Self:
+        """A bench for the methods of another model, beside the same teacher."""
+        other = copy.copy(self)
+        other._runner, other._lock = runner, threading.Lock()
+        other._every_step = {"state": self._every_step["state"]}
+        return other
+
     def measure(self, method: str, points: Sequence[Point], devices: int) -> Outcome:
         """Simulate a method at curve points with the first ``devices`` draws: [P, devices]."""
         return run_points(self._runner, method, points, devices, self.tick)
 
-    def curves(self, method: Method) -> Curves:
+    def curves(self, method: Described) -> Curves:
         """Both curves and the searches for both tolerances."""
-        if method.family not in self._every_step:
-            first = self._at_every_step(method.name, self.protocol.curve_devices)
-            self._every_step[method.family] = first
+        with self._lock:
+            if method.family not in self._every_step:  # it runs beside the grids
+                first = self._at_every_step(method.name, self.protocol.curve_devices)
+                self._every_step[method.family] = first
         return measure_curves(
             lambda points, devices: self.measure(method.name, points, devices),
             self._every_step[method.family],
@@ -77,7 +108,7 @@ class Bench:
             self.protocol,
         )
 
-    def entry(self, method: Method) -> dict[str, Any]:
+    def entry(self, method: Described) -> dict[str, Any]:
         """What ``eval --json`` prints about a method's closed loop."""
         if method.name == "optimal":
             return _perfect_entry(self.protocol, self.teacher_score) | self._scored
@@ -124,7 +155,7 @@ class Bench:
         """What was scored, which tells how many packets a loop at its tolerance really sent."""
         return {"warmup_steps": self.protocol.warmup_steps, "scored_steps": self.protocol.steps}
 
-    def _flat_entry(self, method: Method) -> dict[str, Any]:
+    def _flat_entry(self, method: Described) -> dict[str, Any]:
         """Of a method without a link: one point measured, which is all of both its curves.
 
         It tolerates every link, if its score is acceptable at all.
@@ -132,9 +163,9 @@ class Bench:
         protocol, reference = self.protocol, self.reference
         every = self._at_every_step(
             method.name, max(protocol.curve_devices, protocol.bracket_devices)
-        )
-        few = protocol.curve_devices
-        [point] = reference.describe([EVERY_STEP], every.part(slice(None), slice(few)))
+        )()
+        few = slice(protocol.curve_devices)
+        [point] = reference.describe([EVERY_STEP], every.part(slice(None), few))
         del point["d"]
         low, high = (
             float(end) for end in metrics.interval(reference.score_replicates(every)).ravel()
@@ -182,55 +213,8 @@ class Bench:
         crossing = metrics.first_crossing(gaps, ratios, level, log=kind == "delivery")
         return float(np.clip(crossing, 0.0, gaps[-1]))
 
-    def _at_every_step(self, method: str, devices: int) -> Outcome:
-        return run_points(self._runner, method, [EVERY_STEP], devices, self.tick, reactive=True)
-
-
-def control_errors(
-    method: Method, states: Floats, teacher_n: Floats, force_limit_n: float, horizon: int
-) -> Floats:
-    """Control error of a controller left alone after one packet, on given rollouts.
-
-    Args:
-        method: how to drive.
-        states: rollouts [R, steps + 1, S]; index 0 is the frame before k = 0.
-        teacher_n: the teacher's forces on them [R, steps, *A].
-        force_limit_n: half of the force range.
-        horizon: last j; the packet at k = 0 is j = 0.
-
-    Returns:
-        |ũ - u*| ÷ force range [R, horizon + 1], the mean over a device's forces.
-    """
-    if not method.uses_link:
-        return errors_at_every_step(method, states, teacher_n, force_limit_n, horizon)
-    packets, delay_steps = method.sensor(last_states(states, 0)), method.delay_steps
-    controller = method.controller(len(states))
-    forces_n = play(controller, packets, len(states), horizon + 1, delay_steps=delay_steps)
-    return _errors(forces_n, teacher_n, force_limit_n)
-
-
-def errors_at_every_step(
-    method: Method, states: Floats, teacher_n: Floats, force_limit_n: float, horizon: int
-) -> Floats:
-    """Control error without prediction, with a packet at every step of given rollouts.
-
-    Arguments and result as of :func:`control_errors`.
-    """
-    controller, every = method.reactive(len(states)), np.ones(len(states), dtype=bool)
-    forces_n = []
-    for j in range(horizon + 1):
-        sent = j - method.delay_steps
-        packets = method.sensor(last_states(states, sent)) if sent >= 0 else None
-        forces_n.append(controller.act(every if sent >= 0 else ~every, packets))
-    return _errors(np.stack(forces_n, axis=1), teacher_n, force_limit_n)
-
-
-def _errors(forces_n: Floats, teacher_n: Floats, force_limit_n: float) -> Floats:
-    """Forces as played and the teacher's [R, ≥ steps, *A] → errors [R, steps]."""
-    rollouts, steps = forces_n.shape[:2]
-    forces_n = np.clip(forces_n, -force_limit_n, force_limit_n)
-    errors = metrics.control_error(forces_n, teacher_n[:, :steps], force_limit_n)
-    return np.asarray(errors.reshape(rollouts, steps, -1).mean(axis=-1))
+    def _at_every_step(self, method: str, devices: int) -> Pending:
+        return start_points(self._runner, method, [EVERY_STEP], devices, self.tick, reactive=True)
 
 
 def control_entry(errors: Floats, every_step: Floats, replicates: int, seed: int) -> dict[str, Any]:

@@ -291,24 +291,28 @@ class Curves:
 
 
 def measure_curves(
-    measure: Measure, every_step: Outcome, reference: Reference, protocol: ProtocolSettings
+    measure: Measure,
+    every_step: Callable[[], Outcome],
+    reference: Reference,
+    protocol: ProtocolSettings,
 ) -> Curves:
     """Measure both curves of one method and search both tolerances, always in one batch.
 
     Args:
         measure: simulates points of the method.
-        every_step: the method with a packet at every step (g = 1), [1, curve devices]: the first
-            point of both curves, the same for all methods with one sensor and one actor.
+        every_step: waits for the method with a packet at every step (g = 1), [1, curve devices]:
+            the first point of both curves, the same for all methods with one sensor and one actor.
         reference: the teacher with all bracket devices.
         protocol: grid, devices, level and bracket.
     """
     gaps = [float(gap) for gap in protocol.gaps]
     later = [Point(kind, gap) for kind in KINDS for gap in gaps[1:]]
     outcome = measure(later, protocol.curve_devices) if later else None
+    first = every_step()
     grid, searches = {}, {}
     for number, kind in enumerate(KINDS):
         rows = slice(number * (len(gaps) - 1), (number + 1) * (len(gaps) - 1))
-        parts = [every_step, *([outcome.part(rows)] if outcome else [])]
+        parts = [first, *([outcome.part(rows)] if outcome else [])]
         points, joined = [Point(kind, gap) for gap in gaps], Outcome.joined(parts, axis=0)
         grid[kind] = (points, joined)
         search = Search(kind, gaps, reference.relative_score(joined), reference, protocol)

@@ -4,7 +4,10 @@ So it can be sent to another process: see :mod:`hjepa_cli.core.workers`.
 """
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,10 +16,29 @@ from hjepa_cli.core.loop import Draws, Outcome, simulate
 from hjepa_cli.core.methods import Method, build_method
 from hjepa_cli.core.model import Model
 from hjepa_cli.core.protocol import Point
-from hjepa_cli.settings import Settings
+from hjepa_cli.settings import ProtocolSettings, Settings
 
-BLOCK_DEVICES = 128
-SMALL_DEVICES = 32  # not worth a second process
+# A loop of `hjepa` costs 1.2 times as much in blocks of 640 as in those of 1,280, and 2 times as
+# much in blocks of 260: there the networks' weights are read for few rows (benchmarks/workers.py).
+BLOCK_LOOPS = 512
+
+Tick = Callable[[int], None]
+"""Told how many device-steps (one control step of one device) are done since the last call."""
+
+Pending = Callable[[], Outcome]
+"""Waits for the outcome of what was started."""
+
+
+def silent(steps: int) -> None:
+    """A tick that nobody watches."""
+
+
+class Unit(Protocol):
+    """What is to be computed, as plain data."""
+
+    def compute(self, simulator: "Simulator", tick: Tick) -> Any:
+        """Compute it in the process that has the simulator."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,16 +58,18 @@ class Block:
     stop: int
     reactive: bool = False
 
+    def compute(self, simulator: "Simulator", tick: Tick) -> Outcome:
+        """Simulate the block: outcome arrays [points, stop - start]."""
+        return simulator.simulate(self, tick)
 
-Tick = Callable[[int], None]
-"""Told how many device-steps (one control step of one device) are done since the last call."""
 
-Runner = Callable[[Sequence[Block], Tick], list[Outcome]]
-"""Simulates blocks, in any order, and returns their outcomes in the order of the blocks."""
+Runner = Callable[[Sequence[Block], Tick], Callable[[], list[Outcome]]]
+"""Starts to simulate blocks, in any order; what it returns waits for them and hands out their
+outcomes in the order of the blocks."""
 
 
 class Simulator:
-    """Simulates blocks one after the other, in this process.
+    """Simulates blocks one after the other, in this process: a :data:`Runner`.
 
     Args:
         settings: plant, protocol and seed, from which the draws follow.
@@ -55,20 +79,28 @@ class Simulator:
     def __init__(self, settings: Settings, model: Model | None) -> None:
         protocol = settings.protocol
         devices = max(protocol.curve_devices, protocol.bracket_devices)
-        self._settings, self._model = settings, model
+        self.settings, self._model = settings, model
         self._plant = actual_plant(settings)
-        self._draws = Draws.make(protocol, devices, settings.seed)
+        self._draws = _draws(protocol, devices, settings.seed)
         self._methods: dict[str, Method] = {}
 
-    def __call__(self, blocks: Iterable[Block], tick: Tick) -> list[Outcome]:
-        return [self.run(block, tick) for block in blocks]
+    def __call__(self, blocks: Iterable[Block], tick: Tick) -> Callable[[], list[Outcome]]:
+        outcomes = [self.simulate(block, tick) for block in blocks]
+        return lambda: outcomes
 
-    def run(self, block: Block, tick: Tick) -> Outcome:
+    def run(self, unit: Unit, tick: Tick) -> Any:
+        """Compute a unit."""
+        return unit.compute(self, tick)
+
+    def method(self, name: str) -> Method:
+        """A method, built and fitted when it is asked for first."""
+        if name not in self._methods:
+            self._methods[name] = build_method(name, self.settings, self._model)
+        return self._methods[name]
+
+    def simulate(self, block: Block, tick: Tick) -> Outcome:
         """Simulate one block: outcome arrays [points, stop - start]."""
-        if block.method not in self._methods:
-            method = build_method(block.method, self._settings, self._model)
-            self._methods[block.method] = method
-        method = self._methods[block.method]
+        method = self.method(block.method)
         devices = slice(block.start, block.stop)
         # Phases of the gap schedule go by a device's number, so schedules are made for all.
         schedules = np.stack([point.schedule(self._draws)[:, devices] for point in block.points])
@@ -85,6 +117,12 @@ class Simulator:
         )
 
 
+@functools.lru_cache(maxsize=1)
+def _draws(protocol: ProtocolSettings, devices: int, seed: int) -> Draws:
+    """The draws that the simulators of several models share."""
+    return Draws.make(protocol, devices, seed)
+
+
 def run_points(
     runner: Runner,
     method: str,
@@ -94,15 +132,30 @@ def run_points(
     *,
     reactive: bool = False,
 ) -> Outcome:
-    """Simulate the first ``devices`` devices at some points: outcome arrays [P, devices].
+    """Simulate the first ``devices`` devices at some points: outcome arrays [P, devices]."""
+    return start_points(runner, method, points, devices, tick, reactive=reactive)()
 
-    The devices are cut into blocks, two at least unless they are few, and always the same ones, so
-    that results do not depend on how many processes there are.
+
+def start_points(
+    runner: Runner,
+    method: str,
+    points: Sequence[Point],
+    devices: int,
+    tick: Tick,
+    *,
+    reactive: bool = False,
+) -> Pending:
+    """Start :func:`run_points`; what is returned waits for its result, and may be asked twice.
+
+    A batch is cut by devices, never by points: so its blocks cost the same, whatever each point
+    costs. The cut follows from the batch alone, so that results do not depend on how many
+    processes there are.
     """
-    size = min(BLOCK_DEVICES, max(-(-devices // 2), SMALL_DEVICES))
+    count = min(max(len(points) * devices // BLOCK_LOOPS, 1), devices)
+    cuts = [devices * number // count for number in range(count + 1)]
     blocks = [
-        Block(method, tuple(points), start, min(start + size, devices), reactive)
-        for start in range(0, devices, size)
+        Block(method, tuple(points), start, stop, reactive)
+        for start, stop in itertools.pairwise(cuts)
     ]
-    outcomes = runner(blocks, tick)
-    return Outcome.joined(outcomes, axis=1)
+    started = runner(blocks, tick)
+    return lambda: Outcome.joined(started(), axis=1)

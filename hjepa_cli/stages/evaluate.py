@@ -4,38 +4,29 @@ A trained model (a run's or the zoo's) → closed-loop curves of every method, k
 all they depend on, and tables. ``scale`` takes the same curves through :func:`curves_for`.
 """
 
+import dataclasses
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import threading
+from collections.abc import Generator, Sequence
+from concurrent.futures import Future
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from hjepa_cli.checks import TRUE_STATE, check_methods, check_protocol, split_late
-from hjepa_cli.core.bench import (
-    Bench,
-    control_entry,
-    control_errors,
-    errors_at_every_step,
-)
-from hjepa_cli.core.executors import MAX_WORKERS, cores, open_cluster, placement
+from hjepa_cli.core.bench import Bench, control_entry
+from hjepa_cli.core.control_errors import Alone, LeftAlone, WithEveryPacket
 from hjepa_cli.core.loop import LOOP_VERSION
-from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import BESIDE, WINDOWS
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.protocol import Point
-from hjepa_cli.core.simulator import Runner, Simulator
+from hjepa_cli.core.simulator import Simulator
 from hjepa_cli.core.system import Floats
 from hjepa_cli.core.trajectories import generate
-from hjepa_cli.core.workers import (
-    ModelFile,
-    cluster_runner,
-    one_thread,
-    open_workers,
-    single_thread,
-)
+from hjepa_cli.core.workers import Workers, open_workers
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.screen import Screen, described_steps, in_order, tolerance
+from hjepa_cli.screen import Screen, described_steps, in_order, ticking, tolerance
 from hjepa_cli.settings import Settings
 from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
 from hjepa_cli.storage import curves, runs
@@ -45,7 +36,6 @@ from hjepa_cli.storage.zoo import CURVES_FILE
 
 MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods
 USUAL_ROUNDS = 5  # of the search for tolerances, for the progress bar
-WORTH_WORKERS = 50_000  # device-steps per point; below, processes cost more than they bring
 
 
 def run(
@@ -162,9 +152,22 @@ def curves_for(
     settings = subject.settings
     subject.say_skipped(settings.methods, screen)
     methods = subject.measurable(settings.methods) if methods is None else methods
-    found: dict[str, tuple[Entry, Path]] = {}
-    for one, names in subject.shared_out(methods):
-        found |= _curves_of(one, names, screen, record, remeasure=remeasure, first=one is subject)
+    shares = [
+        _Share(one, names, record, remeasure=remeasure, first=one is subject)
+        for one, names in subject.shared_out(methods)
+    ]
+    jobs = [_Job(name, share) for share in shares for name in share.missing]
+    jobs.sort(key=lambda job: methods.index(job.method))
+    # Closed at once where an interruption comes in here: others are being measured meanwhile.
+    with closing(_measure(subject, screen, jobs)) as measured:
+        for job, entry in measured:
+            job.share.keep(job.method, entry)
+            record.event("measured", method=job.method)
+            screen.say(f"{job.method} measured")
+    for share in shares:
+        share.finish()
+    found = {name: entry for share in shares for name, entry in share.found.items()}
+    found = {name: found[name] for name in methods}  # whichever was ready first
     paths = {name: subject.of(name).path for name in methods if name not in TRUE_STATE}
     return {
         "checkpoint": subject.path,
@@ -183,34 +186,47 @@ def curves_for(
     }
 
 
-def _curves_of(
-    subject: Subject,
-    methods: Sequence[str],
-    screen: Screen,
-    record: Run,
-    *,
-    remeasure: bool,
-    first: bool,
-) -> dict[str, tuple[Entry, Path]]:
-    """The curves of methods that this subject's own model holds, and where they are."""
-    own = record.path(CURVES_FILE if first else curves.further_file(subject.digest))
-    found = {} if remeasure else curves.find(subject.digest, methods, subject.beside)
-    kept: dict[str, Entry] = {}
-    try:
-        kept = curves.read(own, subject.digest)
-    except DataError:
-        if not remeasure:  # which is what its hint says
-            raise
-    found |= {name: (kept[name], own) for name in methods if name in kept}
-    keep = [own, *(path for path in subject.beside if _is_run(path.parent))]
-    missing = [name for name in methods if name not in found]
-    for name, entry in _measure(subject, screen, missing) if missing else ():
-        for path in keep:
-            curves.write(path, subject.digest, {name: entry})
-        record.event("measured", method=name)
-        found[name] = (entry, own)
-    curves.write(own, subject.digest, {name: entry for name, (entry, _) in found.items()})
-    return found
+class _Share:
+    """The methods that one subject's own model holds, and where their curves are kept.
+
+    Args:
+        subject, methods: whose, and which.
+        record: the run that keeps them too.
+        remeasure: do not use cached curves.
+        first: is this the model that the user named?
+
+    Attributes:
+        found: curves and the file that has them, so far.
+        missing: the methods that were not measured before.
+    """
+
+    def __init__(
+        self, subject: Subject, methods: Sequence[str], record: Run, *, remeasure: bool, first: bool
+    ) -> None:
+        self.subject, digest = subject, subject.digest
+        self._own = record.path(CURVES_FILE if first else curves.further_file(digest))
+        self.found = {} if remeasure else curves.find(digest, methods, subject.beside)
+        kept: dict[str, Entry] = {}
+        try:
+            kept = curves.read(self._own, digest)
+        except DataError:
+            if not remeasure:  # which is what its hint says
+                raise
+        self.found |= {name: (kept[name], self._own) for name in methods if name in kept}
+        self.missing = [name for name in methods if name not in self.found]
+        beside = [path for path in subject.beside if _is_run(path.parent)]
+        self._files = [self._own, *beside]
+
+    def keep(self, method: str, entry: Entry) -> None:
+        """Write what was measured, at once."""
+        for path in self._files:
+            curves.write(path, self.subject.digest, {method: entry})
+        self.found[method] = (entry, self._own)
+
+    def finish(self) -> None:
+        """Let the run have the cached curves too."""
+        entries = {name: entry for name, (entry, _) in self.found.items()}
+        curves.write(self._own, self.subject.digest, entries)
 
 
 def cached(subject: Subject, methods: Sequence[str]) -> dict[str, tuple[Entry, Path]]:
@@ -249,9 +265,10 @@ def measure_points(
     devices = settings.protocol.bracket_devices
     device_steps = (len(points) + 1) * _device_steps(settings)
     with (
-        _runner(subject.of(method)) as runner,
-        _ticking(screen, f"verify {method}", device_steps) as tick,
+        open_workers(_device_steps(settings)) as workers,
+        ticking(screen, f"verify {method}", device_steps) as tick,
     ):
+        runner = workers.runner(settings, subject.of(method).file)
         bench = Bench(settings.protocol, settings.seed, runner, tick)
         outcome = bench.measure(method, points, devices)
     return bench.reference.describe(points, outcome)
@@ -315,62 +332,80 @@ def show(result: dict[str, Any], screen: Screen) -> None:
     screen.say(result["source"])
 
 
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """One method to measure, and who has its model and keeps its entry."""
+
+    method: str
+    share: _Share
+
+
 def _measure(
-    subject: Subject, screen: Screen, methods: Sequence[str]
-) -> Iterator[tuple[str, Entry]]:
-    """Entries of ``eval --json``, one method after the other."""
+    subject: Subject, screen: Screen, jobs: Sequence[_Job]
+) -> Generator[tuple[_Job, Entry], None, None]:
+    """Entries of ``eval --json``, in the order in which they are ready."""
+    if not jobs:
+        return
     settings, protocol = subject.settings, subject.settings.protocol
-    states, teacher_n = _clean_rollouts(subject)
-    limit_n, every_step = plant(settings.plant).force_limit_n, dict[str, Floats]()
-    with _runner(subject) as runner:
-        with _ticking(screen, "eval teacher", _device_steps(settings)) as tick:
+    rollouts = _clean_rollouts(subject)
+    with open_workers(_device_steps(settings)) as workers:
+        with ticking(screen, "eval teacher", _device_steps(settings)) as tick:
+            runner = workers.runner(settings, subject.file)
             bench = Bench(protocol, settings.seed, runner, tick)
         if bench.teacher_score < MIN_TEACHER_SCORE:
             screen.say(
                 f"the teacher itself scores only {bench.teacher_score:.2f} here (a sound protocol "
                 f"gives it {MIN_TEACHER_SCORE}): normalised scores say little"
             )
-        for name in methods:
-            with one_thread():  # as workers build it: anchors are fitted to the same bits
-                method = build_method(name, settings, subject.model)
-            with _ticking(screen, f"eval {name}", _usual_device_steps(settings)) as tick:
-                bench.tick = tick
-                rollouts = (states, teacher_n, limit_n, protocol.horizon)
-                if method.family not in every_step:  # with every packet a family plays the same
-                    every_step[method.family] = errors_at_every_step(method, *rollouts)
-                errors = control_errors(method, *rollouts)
-                yield (
-                    name,
-                    {
-                        **control_entry(
-                            errors, every_step[method.family], protocol.bootstrap, settings.seed
-                        ),
-                        **bench.entry(method),
-                        "teacher_score": bench.teacher_score,
-                        "seed": settings.seed,
-                    },
-                )
+        label = f"eval {jobs[0].method}" if len(jobs) == 1 else f"eval {len(jobs)} methods"
+        with ticking(screen, label, len(jobs) * _usual_device_steps(settings)) as tick:
+            bench.tick = tick
+            measured = {
+                share: _Measured(share.subject, bench, workers, rollouts)
+                for share in {job.share for job in jobs}
+            }
+            yield from workers.each(lambda job: measured[job.share].entry(job.method), jobs)
 
 
-@contextmanager
-def _runner(subject: Subject) -> Iterator[Runner]:
-    """Simulate in one process per core, or in this one where that is enough."""
-    settings, count = subject.settings, min(cores(), MAX_WORKERS)
-    where, model = placement(), None
-    if subject.path and subject.model:
-        model = ModelFile(subject.path.absolute(), subject.model.digest)
-    if where.workers is None:
-        several = count > 1 and _device_steps(settings) >= WORTH_WORKERS
-    else:
-        count, several = where.workers, where.workers > 0
-    if where.cluster is not None:
-        with open_cluster(where.cluster, count or cores()) as (executor, _):
-            yield cluster_runner(executor, settings, model)
-    elif several:
-        with open_workers(settings, model, count) as workers:
-            yield workers
-    else:
-        yield single_thread(Simulator(settings, subject.model))
+class _Measured:
+    """Measures the methods of one model; several threads may ask for some.
+
+    Args:
+        subject: whose model that is.
+        bench: with the teacher.
+        workers: compute.
+        rollouts: clean ones, for the NMAE.
+    """
+
+    def __init__(
+        self, subject: Subject, bench: Bench, workers: Workers, rollouts: tuple[Floats, Floats]
+    ) -> None:
+        self._settings, self._model, self._workers = subject.settings, subject.file, workers
+        self._bench = bench.sharing(workers.runner(subject.settings, subject.file))
+        self._rollouts = rollouts
+        self._every_packet: dict[str, Future[Any]] = {}
+        self._lock = threading.Lock()
+
+    def entry(self, name: str) -> Entry:
+        """What ``eval --json`` prints about a method."""
+        [alone] = self._workers.results([self._submit(LeftAlone(name, *self._rollouts))])
+        assert isinstance(alone, Alone)
+        with self._lock:  # with every packet a family plays the same
+            if alone.family not in self._every_packet:
+                unit = WithEveryPacket(name, *self._rollouts)
+                self._every_packet[alone.family] = self._submit(unit)
+        curves_of = self._bench.entry(alone)
+        [every] = self._workers.results([self._every_packet[alone.family]])
+        seed, replicates = self._settings.seed, self._settings.protocol.bootstrap
+        return {
+            **control_entry(alone.errors, every, replicates, seed),
+            **curves_of,
+            "teacher_score": self._bench.teacher_score,
+            "seed": seed,
+        }
+
+    def _submit(self, unit: LeftAlone | WithEveryPacket) -> "Future[Any]":
+        return self._workers.submit(Simulator, self._settings, self._model, unit)
 
 
 def _clean_rollouts(subject: Subject) -> tuple[Floats, Floats]:
@@ -419,21 +454,6 @@ def _usual_device_steps(settings: Settings) -> int:
     protocol = settings.protocol
     grids = 2 * len(protocol.gaps) * protocol.curve_devices * protocol.total_steps
     return grids + 2 * USUAL_ROUNDS * _device_steps(settings)
-
-
-@contextmanager
-def _ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar over device-steps whose number is a guess: it ends full, never overfull."""
-    left = total
-    with screen.progress(label, total, "device-steps") as bar:
-
-        def tick(steps: int) -> None:
-            nonlocal left
-            bar.advance(min(steps, left))
-            left -= min(steps, left)
-
-        yield tick
-        tick(total)
 
 
 def _number(value: float | None, decimals: int) -> str | None:

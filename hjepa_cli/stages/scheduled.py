@@ -13,6 +13,7 @@ from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.cell import Row, best_flat, ratio_of
 from hjepa_cli.core.plant import plant
 from hjepa_cli.core.scheduled import BLOCK_DEVICES
+from hjepa_cli.core.workers import open_workers
 from hjepa_cli.errors import MissingInputError
 from hjepa_cli.screen import Screen, span
 from hjepa_cli.settings import Settings
@@ -59,13 +60,19 @@ def run(
             show(record.result, screen)
             enforce(record.result.get("verify", []), level)
             return record.result
-        cell = ScheduledCell(subject, screen)
-        rows: list[Row] = []
-        for name in methods:
-            for scheduler in settings.radio.schedulers:
-                rows += [cell.row(name, scheduler, snr_db) for snr_db in grid_db]
-                record.event("measured", method=name, scheduler=scheduler)
         radio = settings.radio
+        with open_workers(BLOCK_DEVICES * settings.protocol.total_steps) as workers:
+            cell = ScheduledCell(subject, screen, workers)
+            for name, scheduler in cell.find(methods, grid_db):
+                record.event("measured", method=name, scheduler=scheduler)
+            checked_db = grid_db if radio.load_depends_on_snr else grid_db[:1]
+            checks = cell.verify(methods, checked_db) if verify else []
+        rows: list[Row] = [
+            cell.row(name, scheduler, snr_db)
+            for name in methods
+            for scheduler in radio.schedulers
+            for snr_db in grid_db
+        ]
         result: dict[str, Any] = {
             "checkpoint": subject.path,
             "plant": settings.plant,
@@ -93,14 +100,7 @@ def run(
         result["csv"] = write_csv(record.path("devices.csv"), result["rows"], COLUMNS)
         result["figures"] = draw(result, record.directory, screen)
         if verify:
-            checked_db = grid_db if radio.load_depends_on_snr else grid_db[:1]
-            result["verify"] = [
-                check
-                for name in methods
-                for scheduler in radio.schedulers
-                for snr_db in checked_db
-                for check in cell.verify(name, scheduler, snr_db)
-            ]
+            result["verify"] = checks
         result = record.finish(result)
         show(result, screen)
         enforce(result.get("verify", []), level)

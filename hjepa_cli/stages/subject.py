@@ -13,6 +13,7 @@ from typing import Any
 from hjepa_cli.checks import ANCHORS, RAW_FRAMES, REFLEXES, TRUE_STATE, split_late
 from hjepa_cli.core.model import Model, offered
 from hjepa_cli.core.plant import plant, plant_of
+from hjepa_cli.core.workers import ModelFile
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
@@ -48,6 +49,14 @@ class Subject:
     def name(self) -> str:
         """The models' paths, for people."""
         return ", ".join(str(one.path) for one in (self, *self.further) if one.path) or "no model"
+
+    @property
+    def file(self) -> ModelFile | None:
+        """The model as workers load it."""
+        if self.model is None:
+            return None
+        path = self.path or Path(self.model.digest)
+        return ModelFile(path.absolute(), self.model.digest, self.model)
 
     @property
     def methods(self) -> tuple[str, ...]:

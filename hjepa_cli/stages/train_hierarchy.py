@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hjepa_cli.core import health, levels
-from hjepa_cli.core.bench import control_errors
+from hjepa_cli.core.control_errors import control_errors
 from hjepa_cli.core.hierarchy import Strides
 from hjepa_cli.core.levels import EmbeddedTrajectories
 from hjepa_cli.core.methods import build_method

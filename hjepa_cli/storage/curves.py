@@ -293,11 +293,7 @@ _CHECKS: dict[str, Check] = {
 _LATER: dict[str, Check] = {  # older results of eval are without these
     "nmae_every_step": _is_number,
     "nmae_every_step_ci95": _is_interval,
-    **{
-        f"tolerance_{kind}_{key}": _or_none(_is_number)
-        for kind in ("gap", "p")
-        for key in BESIDE
-    },
+    **{f"tolerance_{kind}_{key}": _or_none(_is_number) for kind in ("gap", "p") for key in BESIDE},
     "warmup_steps": lambda value: type(value) is int and 0 <= value <= LARGEST,
     "scored_steps": _is_count,
 }
