@@ -111,7 +111,7 @@ class Bench:
     def entry(self, method: Described) -> dict[str, Any]:
         """What ``eval --json`` prints about a method's closed loop."""
         if method.name == "optimal":
-            return _perfect_entry(self.protocol, self.teacher_score) | self._scored
+            return self._perfect_entry()
         if not method.uses_link:
             return self._flat_entry(method)
         curves = self.curves(method)
@@ -194,15 +194,39 @@ class Bench:
             "tolerance_p_lq": _probability(lq),
             **{f"tolerance_{name}_{key}": point[key] for name in ("gap", "p") for key in BESIDE},
             **self._scored,
-            **{
-                f"{kind}_curve": [
-                    {**Point(kind, float(gap)).coordinate(), **point} for gap in protocol.gaps
-                ]
-                for kind in KINDS
-            },
-            **{f"{kind}_bracket": [] for kind in KINDS},
+            **self._everywhere(point),
             "n_devices": protocol.bracket_devices,
             "n_curve_devices": protocol.curve_devices,
+        }
+
+    def _perfect_entry(self) -> dict[str, Any]:
+        """Of the teacher at every step against itself: 1 wherever asked, nothing to tolerate."""
+        protocol = self.protocol
+        [point] = self.reference.describe([EVERY_STEP], self._every_step["state"]())
+        point |= {"score": 1.0, "ci95": [1.0, 1.0], "lq_ratio": 1.0}  # no rounding
+        del point["d"]
+        return {
+            "score": 1.0,
+            "score_ci95": [1.0, 1.0],
+            "lq_ratio": 1.0,
+            "bits_per_transmission": None,
+            **{f"tolerance_{name}": None for name in TOLERANCES},
+            **self._everywhere(point),
+            **self._scored,
+            "n_devices": protocol.bracket_devices,
+            "n_curve_devices": protocol.curve_devices,
+        }
+
+    def _everywhere(self, point: dict[str, Any]) -> dict[str, Any]:
+        """Both curves of a method that meets the same at every point of the grid."""
+        return {
+            f"{kind}_{part}": [
+                {**Point(kind, float(gap)).coordinate(), **point} for gap in self.protocol.gaps
+            ]
+            if part == "curve"
+            else []
+            for kind in KINDS
+            for part in ("curve", "bracket")
         }
 
     def _lq_tolerance(self, kind: str, curve: Sequence[dict[str, Any]]) -> float:
@@ -239,34 +263,6 @@ def control_entry(errors: Floats, every_step: Floats, replicates: int, seed: int
         "nmae_every_step": float(at_once.mean()),
         "nmae_every_step_ci95": metrics.mean_interval(at_once, weights).tolist(),
         "n_rollouts": len(errors),
-    }
-
-
-def _perfect_entry(protocol: ProtocolSettings, teacher_score: float) -> dict[str, Any]:
-    """The teacher at every step against itself: 1 wherever it is asked, nothing to tolerate."""
-    perfect = {
-        "score": 1.0,
-        "ci95": [1.0, 1.0],
-        "in_band": teacher_score,
-        "lq_ratio": 1.0,
-        "lost": None,
-        "n_devices": protocol.curve_devices,
-    }
-    return {
-        "score": 1.0,
-        "score_ci95": [1.0, 1.0],
-        "lq_ratio": 1.0,
-        "bits_per_transmission": None,
-        **{f"tolerance_{name}": None for name in TOLERANCES},
-        **{
-            f"{kind}_curve": [
-                {**Point(kind, float(gap)).coordinate(), **perfect} for gap in protocol.gaps
-            ]
-            for kind in KINDS
-        },
-        **{f"{kind}_bracket": [] for kind in KINDS},
-        "n_devices": protocol.bracket_devices,
-        "n_curve_devices": protocol.curve_devices,
     }
 
 
