@@ -6,7 +6,7 @@
 A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and rows, each a name and
 the settings in which it differs from the preset and from what all rows have in ``common``. A row
 with ``strides`` trains these, one with ``flat`` also single levels of these depths on the same
-encoder, with the same actor. A row whose ``encoder.method`` is a baseline on raw frames ends
+encoder, with the same actor, one with ``reflexes`` also what answers a packet by its age. A row whose ``encoder.method`` is a baseline on raw frames ends
 there. A row with a ``checkpoint`` only measures that one.
 
 Everything is kept below ``--out`` in directories named after what they depend on, so rows share
@@ -42,6 +42,7 @@ SECTIONS_OF = {  # a stage's results depend on these settings, and on the stages
     "collect": ("collect",),
     "train-encoder": ("collect", "encoder", "actor"),
     "train-hierarchy": ("collect", "encoder", "actor", "hierarchy"),
+    "train-reflex": ("collect", "encoder", "actor", "hierarchy", "reflex", "protocol"),
 }
 
 
@@ -127,6 +128,10 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
     for depth in row.get("flat", ()):
         flat, _ = levels([depth], hierarchy, hierarchy.name)  # with that model's actor
         measured |= evaluate(flat, [f"ts-jepa-{depth}"], strides)
+    if reflexes := row.get("reflexes"):
+        reflex = directory("train-reflex", hierarchy.name)
+        run("train-reflex", "--dataset", data, "--checkpoint", hierarchy, "--out", reflex)
+        measured |= evaluate(reflex, reflexes, strides)
     return {"health": health, "methods": measured}  # of the actor that drives, not of a probe
 
 
@@ -157,7 +162,7 @@ def write(
     path.with_suffix(".json").write_text(json.dumps(measured, indent=1))
     windows = windows_of(measured)
     head = ["row", "method", "n", *(f"R² {name}" for name in PROBES), "actor NRMSE"]
-    head += [*(f"NMAE {window}" for window in windows), "gap D* [steps]"]
+    head += [*(f"NMAE {window}" for window in windows), "gap D* [steps]", "delivery p*"]
     lines = [head, ["---"] * len(head)]
     for name, by_seed in measured.items():
         methods = next(iter(by_seed.values()))["methods"]
@@ -180,10 +185,13 @@ def write(
                         )
                         for window in windows
                     ),
-                    over_seeds(
-                        [entry["tolerance_gap_steps"] for entry in entries],
-                        1,
-                        entries[0]["tolerance_gap_ci95"],
+                    *(
+                        over_seeds(
+                            [entry[f"tolerance_{key}"] for entry in entries],
+                            decimals,
+                            entries[0][f"tolerance_{kind}_ci95"],
+                        )
+                        for key, kind, decimals in (("gap_steps", "gap", 1), ("p", "p", 4))
                     ),
                 ]
             )
@@ -250,9 +258,12 @@ def compared(measured: dict[str, dict[int, dict[str, Any]]]) -> str:
             method: {seed: result["methods"][method] for seed, result in by_seed.items()}
             for method in methods
         }
-        for one in differences(by_method):
-            ratio = one["tolerance_gap_ratio"]
-            parts = [f"D* × {told(ratio, 3)}" if ratio else "D* –"]
+        for one in differences(by_method, left_out=()):  # each seed has draws of its own
+            ratios = one["tolerance_gap_ratio"], one["tolerance_p_ratio"]
+            parts = [
+                f"{name} {told(ratio, 3)}" if ratio else f"{name} –"
+                for name, ratio in zip(("D* ×", "its p* ×"), ratios, strict=True)
+            ]
             parts += [f"NMAE {window} {told(by, 5)}" for window, by in one["nmae_windows"].items()]
             of = f"{one['method']} over {one['over']}, n = {len(by_seed)}"
             lines.append(f"- {name}: {of}: {'; '.join(parts)}")

@@ -329,18 +329,26 @@ def over_trainings(
     return array.mean(axis=0).tolist(), interval.T.tolist()
 
 
-def differences(by_method: Mapping[str, Mapping[int, Entry]]) -> list[dict[str, Any]]:
-    """The first method against each other one that is trained, paired within trainings.
+def differences(
+    by_method: Mapping[str, Mapping[int, Entry]], left_out: Sequence[str] = TRUE_STATE
+) -> list[dict[str, Any]]:
+    """Compare the first method with each other one, paired within trainings.
+
+    Args:
+        by_method: entries by training seed.
+        left_out: methods that are not paired, since no training and no draw of theirs differs.
 
     Returns:
-        Per other method: ``nmae_windows`` and ``nmae_every_step``, first minus other, and
-        ``tolerance_gap_ratio``, first ÷ other; each with ``mean`` and ``ci95`` (of the ratio the
-        geometric mean, its interval taken on the logarithm; ``None`` where a gap is a bound only).
+        Per other method: ``nmae_windows`` and ``nmae_every_step``, first minus other;
+        ``tolerance_gap_ratio``, D* of the first ÷ the other's; and ``tolerance_p_ratio``, p* of the
+        other ÷ the first's, so that more than 1 is the first method's lead in both. Each has
+        ``mean`` and ``ci95``; of a ratio the geometric mean, its interval taken on the logarithm,
+        and ``None`` where a tolerance is a bound only.
     """
     first, *others = by_method
     found: list[dict[str, Any]] = []
     for other in others:
-        if other in TRUE_STATE or first in TRUE_STATE:
+        if other in left_out or first in left_out:
             continue
         pairs = [(by_method[first][s], by_method[other][s]) for s in by_method[first]]
         windows = {
@@ -350,25 +358,30 @@ def differences(by_method: Mapping[str, Mapping[int, Entry]]) -> list[dict[str, 
             for window in pairs[0][0]["nmae_windows"]
         }
         every = _described([a["nmae_every_step"] - b["nmae_every_step"] for a, b in pairs])
-        gaps = [(a["tolerance_gap_steps"], b["tolerance_gap_steps"]) for a, b in pairs]
-        censored = any(entry["tolerance_gap_censored"] for pair in pairs for entry in pair)
-        ratio = None
-        if all(a and b for a, b in gaps) and not censored:
-            logarithm = _described([math.log(a / b) for a, b in gaps])
-            ratio = {
-                "mean": math.exp(logarithm["mean"]),
-                "ci95": [math.exp(end) for end in logarithm["ci95"]],
-            }
         found.append(
             {
                 "method": first,
                 "over": other,
                 "nmae_windows": windows,
                 "nmae_every_step": every,
-                "tolerance_gap_ratio": ratio,
+                "tolerance_gap_ratio": _ratio(pairs, "gap_steps", "gap"),
+                "tolerance_p_ratio": _ratio([(b, a) for a, b in pairs], "p", "p"),
             }
         )
     return found
+
+
+def _ratio(pairs: Sequence[tuple[Entry, Entry]], key: str, kind: str) -> dict[str, Any] | None:
+    """Geometric mean of the ratio of a tolerance, first ÷ second, with its interval."""
+    values = [tuple(entry[f"tolerance_{key}"] for entry in pair) for pair in pairs]
+    censored = any(entry[f"tolerance_{kind}_censored"] for pair in pairs for entry in pair)
+    if censored or not all(a and b for a, b in values):
+        return None
+    logarithm = _described([math.log(a / b) for a, b in values])
+    return {
+        "mean": math.exp(logarithm["mean"]),
+        "ci95": [math.exp(end) for end in logarithm["ci95"]],
+    }
 
 
 def _described(values: Sequence[float]) -> dict[str, Any]:
@@ -404,15 +417,16 @@ def show(document: Mapping[str, Any], screen: Screen) -> None:
     if not found:
         return
     screen.table(
-        f"{found[0]['method']} minus the other, in NMAE, and its gap D* ÷ the other's: mean (95 % "
-        "CI), paired within trainings",
-        ["other", *(f"NMAE {w}" for w in windows), "every packet", "gap ratio"],
+        f"{found[0]['method']} minus the other, in NMAE; its gap D* ÷ the other's, and the other's "
+        "p* ÷ its own: mean (95 % CI), paired within trainings",
+        ["other", *(f"NMAE {w}" for w in windows), "every packet", "D* ratio", "p* ratio"],
         [
             [
                 one["over"],
                 *(_spanned(one["nmae_windows"][w], 4) for w in windows),
                 _spanned(one["nmae_every_step"], 4),
                 _spanned(one["tolerance_gap_ratio"], 3),
+                _spanned(one["tolerance_p_ratio"], 3),
             ]
             for one in found
         ],
