@@ -6,8 +6,9 @@
 A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and rows, each a name and
 the settings in which it differs from the preset and from what all rows have in ``common``. A row
 with ``strides`` trains these, one with ``flat`` also single levels of these depths on the same
-encoder, with the same actor, one with ``reflexes`` also what answers a packet by its age. A row whose ``encoder.method`` is a baseline on raw frames ends
-there. A row with a ``checkpoint`` only measures that one.
+encoder, with the same actor, one with ``reflexes`` also what answers a packet by its age. A row
+whose ``encoder.method`` is a baseline on raw frames ends there. A row with a ``checkpoint`` only
+measures that one.
 
 Everything is kept below ``--out`` in directories named after what they depend on, so rows share
 what they can (one dataset, one encoder), an interrupted study goes on with the same command, and a
