@@ -205,6 +205,7 @@ def test_loads_of_two_seeds_are_compared_seed_by_seed(stage):
     assert math.sqrt(low * high) == pytest.approx(math.sqrt(ratios[0] * ratios[1]))
 
 
+@pytest.mark.slow
 def test_the_bytes_do_not_depend_on_how_many_work(tmp_path, monkeypatch):
     """The other seeds start from what the first one found, whoever is ready first."""
     monkeypatch.chdir(tmp_path)
@@ -212,7 +213,7 @@ def test_the_bytes_do_not_depend_on_how_many_work(tmp_path, monkeypatch):
     flags = {
         "radio.law": "scheduled",
         "radio.schedulers": ["round-robin", "max-aoi"],
-        "radio.seeds": 3,
+        "radio.seeds": 2,
         "radio.snr_db": "20",
         "methods": ["hold-true"],
     }
