@@ -210,22 +210,23 @@ def test_loads_of_two_seeds_are_compared_seed_by_seed(stage):
     assert math.sqrt(low * high) == pytest.approx(math.sqrt(ratios[0] * ratios[1]))
 
 
+@pytest.mark.slow
 def test_the_bytes_do_not_depend_on_how_many_work(tmp_path, monkeypatch):
     """The other seeds start from what the first one found, whoever is ready first."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(scheduled, "enforce", lambda *_: None)  # 40 steps verify nothing
+    monkeypatch.setattr(scheduled, "enforce", lambda *_: None)  # 120 steps verify nothing
     flags = {
         "radio.law": "scheduled",
         "radio.schedulers": ["round-robin", "max-aoi"],
-        "radio.seeds": 3,
+        "radio.seeds": 2,
         "radio.snr_db": "20",
-        "methods": ["hold-true", "zero-true"],
+        "methods": ["hold-true"],
     }
-    settings, kept = load_settings(flags={**SMALL, "protocol.steps": 40, **flags}), set()
+    settings, kept = load_settings(flags={**SMALL, "protocol.steps": 120, **flags}), set()
     for count in (0, 1, 2):
         with placed(count):
             result = scale.run(settings, Screen(True, stdout=io.StringIO()), verify=True)
-        assert [row["devices"] > 0 for row in result["rows"]] == 4 * [True]
+        assert [1 < row["load_per_block"] < 512 for row in result["rows"]] == [True, True]
         assert result["verify"]
         kept.add(json.dumps({key: result[key] for key in ("rows", "gains", "verify")}))
     assert len(kept) == 1
