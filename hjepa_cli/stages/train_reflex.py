@@ -16,8 +16,8 @@ from numpy.random import Generator
 from torch import Tensor, nn
 
 from hjepa_cli.core import decay_fit, health, reflex_training
-from hjepa_cli.core.bench import control_errors
 from hjepa_cli.core.codecs import build_codec
+from hjepa_cli.core.control_errors import control_errors
 from hjepa_cli.core.decay_fit import Law, Trial
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.metrics import window_means
