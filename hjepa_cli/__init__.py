@@ -25,6 +25,7 @@ _HOMES = {
     "teacher": "hjepa_cli.core.policy",
     "train_encoder": "hjepa_cli.api",
     "train_hierarchy": "hjepa_cli.api",
+    "train_reflex": "hjepa_cli.api",
 }
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
         simulate_cell,
         train_encoder,
         train_hierarchy,
+        train_reflex,
     )
     from hjepa_cli.core.camera import Camera
     from hjepa_cli.core.model import Model
@@ -62,6 +64,7 @@ __all__ = [
     "teacher",
     "train_encoder",
     "train_hierarchy",
+    "train_reflex",
 ]
 
 

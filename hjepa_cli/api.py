@@ -107,11 +107,11 @@ def drive(
         gap_steps: a packet every so many steps; or
         delivery: a packet at every step that arrives with this probability. Neither: all arrive.
         devices: n.
-        preset, settings: plant, seed and protocol (its steps K).
+        preset, settings: plant, seed and protocol: K steps, its warm-up and those it scores.
 
     Returns:
-        ``states`` [K, n, S], ``forces_n`` [K, n, *A], ``score`` [n] (share of steps inside the
-        band), ``cost`` [n] (mean capped quadratic cost).
+        ``states`` [K, n, S] and ``forces_n`` [K, n, *A] of all steps; of those that are scored
+        ``score`` [n] (share inside the band) and ``cost`` [n] (mean capped quadratic cost).
 
     Raises:
         UsageError: unknown method, both kinds of link, or no device.
@@ -169,12 +169,13 @@ def simulate_cell(
         blocks: J resource blocks in every slot, each as long as a packet.
         scheduler: who gets them.
         model: of :func:`load_model`, of the same plant.
-        preset, settings: plant, seed and protocol (its steps K); of ``radio``, the power margin,
+        preset, settings: plant, seed and protocol; of ``radio``, the power margin,
             how long fades last and the share of transmissions that fail, none of which is repeated.
 
     Returns:
         ``score`` [N] (share of steps inside the band), ``cost`` [N] (mean capped quadratic cost),
-        ``packets`` [N] that arrived, ``reports`` of all devices to a scheduler that asks for them.
+        ``packets`` [N] that arrived, ``reports`` of all devices to a scheduler that asks for them;
+        all of them in the scored steps.
 
     Raises:
         UsageError: unknown method or scheduler, a method without packets of a slot, more blocks
@@ -249,6 +250,27 @@ def train_hierarchy(
         _silent(),
         dataset=_path(dataset),
         encoder=None if encoder is None else str(encoder),
+        out=_path(out),
+    )
+
+
+def train_reflex(
+    *,
+    dataset: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    out: str | Path | None = None,
+    preset: str | None = None,
+    config: str | Path | None = None,
+    settings: Values | None = None,
+) -> dict[str, Any]:
+    """Train rivals that predict nothing, as ``hjepa train-reflex``; returns the document."""
+    from hjepa_cli.stages.train_reflex import run
+
+    return run(
+        _settings(preset, config, settings),
+        _silent(),
+        dataset=_path(dataset),
+        checkpoint=None if checkpoint is None else str(checkpoint),
         out=_path(out),
     )
 

@@ -113,7 +113,7 @@ def test_the_figure_has_every_method_and_its_band(shell):
     [
         ({"plant": "gym"}, ("plant is 'desktop'", "'gym' in runs/eval/seed-1")),
         ({"loop_version": 1}, ("loop_version is 2", "1 in")),
-        ({"protocol": {"steps": 250}}, ("protocol.steps is 1000", "250 in")),
+        ({"protocol": {"steps": 250}}, ("protocol.steps is 3000", "250 in")),
         ({"horizon": [0, 1]}, ("horizon",)),
         ({"collect": {"x_m": 0.3}}, ("collect.x_m", "0.3 in")),
         ({"collect": {"start": [0.1, 0.2, 0.1, 0.2]}}, ("collect.start",)),

@@ -123,7 +123,7 @@ def test_a_finished_run_is_repeated_not_redone() -> None:
     before = {path: path.read_bytes() for path in Path("out").iterdir()}
     with Run.create("eval", Path("out"), SETTINGS) as run:
         assert run.result == {"score": 0.5}
-    other = r"a finished run with other settings: protocol\.steps = 1000, not 999"
+    other = r"a finished run with other settings: protocol\.steps = 3000, not 999"
     with pytest.raises(UsageError, match=other):
         Run.create("eval", Path("out"), changed("protocol.steps", 999))
     assert {path: path.read_bytes() for path in Path("out").iterdir()} == before
