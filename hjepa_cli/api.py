@@ -20,6 +20,7 @@ from hjepa_cli.checks import check_count, check_schedulable
 from hjepa_cli.command import resolve
 from hjepa_cli.core import cell_loop
 from hjepa_cli.core.conditions import actual_plant
+from hjepa_cli.core.load_simulator import CALIBRATION_SEED
 from hjepa_cli.core.loop import Draws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.methods import build_method
 from hjepa_cli.core.model import Model
@@ -27,7 +28,6 @@ from hjepa_cli.core.uplink import Access
 from hjepa_cli.errors import UsageError
 from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings
-from hjepa_cli.stages.scheduled_cell import CALIBRATION_SEED
 from hjepa_cli.storage import datasets, zoo
 
 Values = Mapping[str, Any]
