@@ -424,7 +424,9 @@ def entry_of(score: float) -> dict[str, Any]:
     return {
         **{key: [] for key in lists},
         **dict.fromkeys((*tolerances, *beside, "nmae_every_step"), 1.0),
-        "warmup_steps": 0, "scored_steps": 24, "nmae_every_step_ci95": [0.0, 2.0],
+        "warmup_steps": 0,
+        "scored_steps": 24,
+        "nmae_every_step_ci95": [0.0, 2.0],
         **dict.fromkeys(counts, 1),
         **{key: [0.0, 2.0] for key in ("score_ci95", "tolerance_gap_ci95", "tolerance_p_ci95")},
         **dict.fromkeys(("tolerance_gap_censored", "tolerance_p_censored"), False),

@@ -84,7 +84,7 @@ def test_the_defaults_are_those_of_the_papers() -> None:
         5.0,
     )
     protocol = settings.protocol
-    assert protocol.gaps == (1, 5, 20, 40, 80, 120, 160, 200, 240, 320)
+    assert protocol.gaps == (1, 20, 40, 80, 120, 160, 240, 320)
     assert (protocol.warmup_steps, protocol.steps) == (1000, 3000)
     paper = load_settings(flags={"protocol": "paper"}).protocol
     assert (paper.warmup_steps, paper.steps, paper.bracket_devices) == (0, 1000, 256)

@@ -227,7 +227,7 @@ class Search:
         if self._rounds > MAX_GUESSES or right / left <= width**2:
             return [self._middle(left, right)]
         guess = self._guess(left, right, scores)
-        if self._measured.keys() <= self._grid.keys():
+        if not self._measured:
             ends = min(self._grid), max(self._grid)
             fan = (guess / self._step_out, guess, guess * self._step_out)
             return sorted({min(max(gap, ends[0]), ends[1]) for gap in fan})
