@@ -94,19 +94,19 @@ def test_the_warm_up_is_not_scored() -> None:
 
 
 def test_steady_state_stays_when_the_scored_time_is_doubled_and_the_start_flatters() -> None:
-    """The oracle at D = 110: two halves of the scored time agree, the first second is better."""
-    draws = Draws.make(protocol(warmup_steps=0, steps=5000), 48, seed=0)
+    """The oracle at D = 140: two halves of the scored time agree, the first second is better."""
+    draws = Draws.make(protocol(warmup_steps=0, steps=5000), 160, seed=0)
     inside: list[np.ndarray] = []
-    drive = Oracle(DESKTOP.teacher(), DESKTOP.advance, DESKTOP.force_limit_n, 48)
-    schedule = gap_schedule(110, 5000, 48)[None]
+    drive = Oracle(DESKTOP.teacher(), DESKTOP.advance, DESKTOP.force_limit_n, 160)
+    schedule = gap_schedule(140, 5000, 160)[None]
     watch = lambda k, states, forces_n: inside.append(DESKTOP.in_band(states))  # noqa: E731
     simulate(DESKTOP, draws, schedule, drive, true_state, watch=watch)
     scores = np.array(inside, float)
     start, first, second = scores[:1000].mean(0), scores[1000:3000].mean(0), scores[3000:].mean(0)
-    error = np.std(first - second, ddof=1) / math.sqrt(48)
+    error = np.std(first - second, ddof=1) / math.sqrt(160)
     assert abs(np.mean(first - second)) < 3 * error
     gain = start - scores[1000:].mean(0)
-    assert np.mean(gain) > 2 * np.std(gain, ddof=1) / math.sqrt(48)
+    assert np.mean(gain) > 2 * np.std(gain, ddof=1) / math.sqrt(160)
 
 
 def test_loops_that_fell_are_lost() -> None:
