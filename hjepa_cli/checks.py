@@ -177,23 +177,32 @@ def check_methods(methods: tuple[str, ...]) -> None:
             raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
 
 
-def check_protocol(protocol: ProtocolSettings) -> None:
-    """Check that what is scored is long enough to say something.
+def check_warmup(protocol: ProtocolSettings) -> None:
+    """Check that no less is scored than was left out before.
+
+    Raises:
+        UsageError: fewer scored steps than the warm-up has.
+    """
+    if protocol.steps < protocol.warmup_steps:
+        raise UsageError(
+            f"protocol.steps = {protocol.steps} are scored after protocol.warmup_steps = "
+            f"{protocol.warmup_steps}; expected at least as many as the warm-up has",
+            hint=f"--protocol paper, or steps = {protocol.warmup_steps} or more in "
+            "--config FILE.toml",
+        )
+
+
+def check_gaps(protocol: ProtocolSettings) -> None:
+    """Check that what is scored is long enough for the gaps between packets.
 
     Raises:
         UsageError: fewer scored steps than the warm-up has, or than the longest gap.
     """
-    steps, warmup_steps, longest = protocol.steps, protocol.warmup_steps, protocol.gaps[-1]
-    if steps < warmup_steps:
+    check_warmup(protocol)
+    if (longest := protocol.gaps[-1]) > protocol.steps:
         raise UsageError(
-            f"protocol.steps = {steps} are scored after protocol.warmup_steps = {warmup_steps}; "
-            "expected at least as many as the warm-up has",
-            hint=f"--protocol paper, or steps = {warmup_steps} or more in --config FILE.toml",
-        )
-    if longest > steps:
-        raise UsageError(
-            f"protocol.gaps end with {longest} steps, and protocol.steps = {steps} are scored; "
-            "expected gaps no longer than that",
+            f"protocol.gaps end with {longest} steps, and protocol.steps = {protocol.steps} are "
+            "scored; expected gaps no longer than that",
             hint=f"steps = {longest} or more, or shorter gaps, in --config FILE.toml",
         )
 

@@ -562,3 +562,30 @@ def test_full_disk(dataset, shell):
     assert len(done.stderr.splitlines()) <= 2
     assert not list(Path("new").glob("*.json")) and not list(Path("new").glob("shard-*"))
     shutil.rmtree("new", ignore_errors=True)
+
+
+@pytest.mark.parametrize(
+    ("section", "arguments", "says"),
+    [
+        ("steps = 500", ("eval",), ("protocol.steps = 500", "warmup_steps = 1000")),
+        ("steps = 500", ("scale",), ("protocol.steps = 500", "warmup_steps = 1000")),
+        ("steps = 500", ("reproduce",), ("protocol.steps = 500", "warmup_steps = 1000")),
+        ("steps = 500", ("scale", "--law", "scheduled"), ("steps = 500", "warmup_steps = 1000")),
+        ("gaps = [1, 4000]", ("eval",), ("4000 steps", "protocol.steps = 3000")),
+        ("gaps = [1, 4000]", ("scale",), ("4000 steps", "protocol.steps = 3000")),
+        (
+            "gaps = [1, 1200]",
+            ("eval", "--protocol", "paper"),
+            ("1200 steps", "protocol.steps = 1000"),
+        ),
+    ],
+)
+def test_protocols_that_score_too_little_are_refused_with_both_numbers(
+    shell, section, arguments, says
+):
+    (shell.directory / "short.toml").write_text(f"[protocol]\n{section}\n")
+    refused(shell, 2, *arguments, "--config", "short.toml", says=says)
+
+
+def test_an_unknown_protocol_is_refused(shell):
+    refused(shell, 2, "eval", "--protocol", "transient", says=["choose one of steady, paper"])

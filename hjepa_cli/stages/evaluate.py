@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import TRUE_STATE, check_methods, check_protocol, split_late
+from hjepa_cli.checks import TRUE_STATE, check_gaps, check_methods, split_late
 from hjepa_cli.core.bench import Bench, control_entry
 from hjepa_cli.core.control_errors import Alone, LeftAlone, WithEveryPacket
 from hjepa_cli.core.loop import LOOP_VERSION
@@ -98,7 +98,7 @@ def open_measurable(
     Args and errors are those of :func:`run`.
     """
     check_methods(settings.methods)
-    check_protocol(settings.protocol)
+    check_gaps(settings.protocol)
     if figure and find_spec("matplotlib") is None:
         raise MissingInputError(
             "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli import plan
-from hjepa_cli.checks import LINKLESS, TRUE_STATE, check_protocol, check_schedulable
+from hjepa_cli.checks import LINKLESS, TRUE_STATE, check_gaps, check_schedulable
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.model import offered
 from hjepa_cli.core.plant import plant
@@ -96,7 +96,7 @@ def check(settings: Settings) -> None:
         check_schedulable(linked, settings.protocol.total_steps)
     check_stride(max(settings.encoder.h, settings.hierarchy.h), collected.steps)
     check_horizon(settings.protocol.horizon, collected.clean_steps)
-    check_protocol(settings.protocol)
+    check_gaps(settings.protocol)
     parse_snr(settings.radio.snr_db)
 
 

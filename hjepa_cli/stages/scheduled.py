@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import LINKLESS, check_schedulable
+from hjepa_cli.checks import LINKLESS, check_schedulable, check_warmup
 from hjepa_cli.core.capacity import parse_snr
 from hjepa_cli.core.cell import Row, best_flat, ratio_of
 from hjepa_cli.core.plant import plant
@@ -121,6 +121,7 @@ def open_schedulable(
     """
     linked = [name for name in settings.methods if name not in LINKLESS]
     check_schedulable(linked, settings.protocol.total_steps)
+    check_warmup(settings.protocol)
     subject = open_subject(settings, screen, checkpoint, None, further)
     methods = subject.measurable(linked)
     if not methods:
