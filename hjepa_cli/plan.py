@@ -177,9 +177,10 @@ def plan_train_reflex(
     samples = len(NETWORKS) * options.steps * options.batch_packets * options.batch_ages
     plans = len(NETWORKS) * views * settings.collect.trajectories * settings.collect.steps
     loops = options.search_candidates * options.search_rounds * options.search_devices
-    searched = 2 * loops * len(AROUND) * options.search_steps
+    steps = settings.protocol.warmup_steps + options.search_steps
+    searched = 2 * loops * len(AROUND) * steps
     fitted = 2 * options.fit_candidates * options.fit_rounds * options.fit_devices * len(AROUND)
-    seen = fitted * options.search_steps / settings.protocol.gaps[-1]  # about two packets a gap
+    seen = fitted * steps / settings.protocol.gaps[-1]  # about two packets a gap
     return Plan(
         command="train-reflex",
         reads=[_dataset(dataset, settings), _trained(checkpoint, settings)],
@@ -199,7 +200,7 @@ def plan_train_reflex(
                 "encoded frames": (1 + views) * frames,
                 "reflex training samples": samples,
                 "device-steps of searches": searched + plans * settings.protocol.gaps[-1],
-                "device-steps on states": fitted * options.search_steps,
+                "device-steps on states": fitted * steps,
                 "closed-loop frames": 4 * seen,
             }
         ),
