@@ -43,7 +43,7 @@ SECTIONS_OF = {  # a stage's results depend on these settings, and on the stages
     "collect": ("collect",),
     "train-encoder": ("collect", "encoder", "actor"),
     "train-hierarchy": ("collect", "encoder", "actor", "hierarchy"),
-    "train-reflex": ("collect", "encoder", "actor", "hierarchy", "reflex"),
+    "train-reflex": ("collect", "encoder", "actor", "hierarchy", "reflex", "protocol"),
 }
 
 

@@ -111,12 +111,13 @@ def _summary(model: ZooModel) -> Result:
     architecture = model.metadata.get("architecture")
     if not isinstance(architecture, dict):
         raise DataError(f"{model.path} does not say what it is: no architecture")
+    plans = architecture.get("kind") != "reflex"  # it keeps those of the model that it is beside
     return {
         "name": model.name,
         "path": str(model.path),
         "kind": architecture.get("kind"),
         "plant": model.metadata.get("plant"),
-        "strides": {key: architecture.get(key) for key in ("h", "m", "l")},
+        "strides": {key: architecture.get(key) if plans else None for key in ("h", "m", "l")},
         "size_bytes": model.size_bytes,
         "curves": model.has_curves,
         "sha256": model.digest,

@@ -354,12 +354,14 @@ ProcessNoise = Annotated[
 ]
 Protocol = Annotated[
     str | None,
-    _one_of(
-        LOOP,
+    typer.Option(
         "--protocol",
-        "Score the steps after a warm-up, or as the paper from the start on: 1,000 steps of 256 "
-        "devices, for its Fig. 3 and 4. (Without it: steady.)",
-        *PROTOCOLS,
+        help="Score steady state, after a warm-up, or as the paper does from the start on, for "
+        "its Fig. 3 and 4.",
+        metavar="|".join(PROTOCOLS),
+        rich_help_panel=LOOP,
+        show_default=PROTOCOLS[0],
+        autocompletion=lambda: list(PROTOCOLS),
     ),
 ]
 PlantSpread = Annotated[

@@ -313,7 +313,8 @@ def origins(
     """Where each value of :func:`load_settings` comes from.
 
     Returns:
-        Dotted key to ``"default"``, ``"preset NAME"``, the config file's path or ``"flag"``.
+        Dotted key to ``"default"``, ``"preset NAME"``, ``"protocol paper"``, the config file's path
+        or ``"flag"``.
 
     Raises:
         As :func:`load_settings`.

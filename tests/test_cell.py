@@ -66,7 +66,7 @@ def test_duty_charges_the_packet_that_everybody_sends_at_the_start():
     }
     assert counted == {
         "steady": math.floor(c * 180.9),
-        "start": math.floor(c * 1000 / (1000 / 180.9 + 1)),
+        "start": math.floor(c * 1000 / (1000 / 180.9 + 1 - 1 / 180.9)),
     }
 
 

@@ -75,6 +75,13 @@ def test_packets_are_counted_as_a_loop_sends_them(
     assert packets_per_step(gap, steps, warmup) == pytest.approx(sent, rel=0.01)
 
 
+@pytest.mark.parametrize("gap", [1.0, 1.5, 2.0, 7.3])
+def test_the_packet_at_the_start_is_counted_exactly(gap: float) -> None:
+    """Over 60 steps of 20,000 devices: the packet at 0 is more only where none was due."""
+    sent = gap_schedule(gap, 60, 20_000).mean()
+    assert packets_per_step(gap, 60, 0) == pytest.approx(sent, rel=2e-3)
+
+
 def test_the_warm_up_is_not_scored() -> None:
     """Scores after a warm-up are those of the same steps of a longer simulation."""
     options = protocol(steps=100, warmup_steps=200)

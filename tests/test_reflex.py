@@ -32,6 +32,7 @@ from hjepa_cli.screen import Screen
 from hjepa_cli.settings import Settings, load_settings
 from hjepa_cli.stages import collect, resume, train_encoder, train_hierarchy, train_reflex
 from hjepa_cli.stages.progress import PROGRESS_FILE
+from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 
 QUIET = Screen(quiet=True)
@@ -132,8 +133,7 @@ def test_a_force_that_fades_needs_no_predictor() -> None:
     """
     kind, gaps, devices, steps = plant("desktop"), (80, 110, 140), 256, 1000
     options = dataclasses.replace(load_settings(flags={"protocol": "paper"}).protocol, steps=steps)
-    drawn = Draws.make(options, devices, seed=0)
-    draws = dataclasses.replace(drawn, noise=drawn.noise[:steps], delivery=drawn.delivery[:steps])
+    draws = Draws.make(options, devices, seed=0)
     law_n = np.array([22.8, 10.2, 58.6, 5.5])
     fading = DecayingHold(
         lambda states: (law_n * states).sum(-1), 1.0, 8.6, kind.force_limit_n, 3 * devices
@@ -510,7 +510,10 @@ def test_a_dry_run_plans_and_writes_nothing(workplace: Path, shell: Shell) -> No
     assert planned.code == 0 and "train 2 networks for 10 steps" in planned.out
 
 
-def test_eval_says_how_to_train_what_is_missing(workplace: Path, shell: Shell) -> None:
+def test_eval_says_how_to_train_what_is_missing(
+    workplace: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zoo, "list_models", list)  # which has the reflexes of another model
     (shell.directory / "tiny.toml").write_text(
         "[protocol]\nwarmup_steps = 0\nsteps = 12\ngaps = [1, 4]\ncurve_devices = 2\n"
         "bracket_devices = 2\n"

@@ -121,7 +121,9 @@ class Bench:
             for kind, search in curves.searches.items()
         }
         gap, delivery = (curves.searches[kind].result() for kind in KINDS)
-        lq_gap, lq_delivery = (self._lq_tolerance(kind, described[kind]) for kind in KINDS)
+        lq_gap, lq_delivery = (
+            self._lq_tolerance(kind, described[kind] + brackets[kind]) for kind in KINDS
+        )
         there = {
             f"tolerance_{name}_{key}": value
             for name, kind, found in (("gap", "gap", gap), ("p", "delivery", delivery))
@@ -229,10 +231,11 @@ class Bench:
             for part in ("curve", "bracket")
         }
 
-    def _lq_tolerance(self, kind: str, curve: Sequence[dict[str, Any]]) -> float:
-        """Where the grid's LQ ratio falls below its own acceptable value; like the tolerance."""
-        gaps = np.array(self.protocol.gaps, dtype=np.float64)
-        ratios = np.array([entry["lq_ratio"] for entry in curve])
+    def _lq_tolerance(self, kind: str, described: Sequence[dict[str, Any]]) -> float:
+        """Where the LQ ratio falls below its own acceptable value, on all points that there are."""
+        at = _by_gap(described)
+        gaps = np.array(sorted(at))
+        ratios = np.array([at[gap]["lq_ratio"] for gap in gaps])
         level = self.protocol.acceptable_lq_ratio
         crossing = metrics.first_crossing(gaps, ratios, level, log=kind == "delivery")
         return float(np.clip(crossing, 0.0, gaps[-1]))
@@ -268,9 +271,14 @@ def control_entry(errors: Floats, every_step: Floats, replicates: int, seed: int
 
 def _at(gap: float, described: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Interpolate what stands beside the score at a mean gap between the points around it."""
-    at = {point["d"] if "d" in point else 1 / point["p"]: point for point in described}
+    at = _by_gap(described)
     gaps = sorted(at)
     return {key: float(np.interp(gap, gaps, [at[one][key] for one in gaps])) for key in BESIDE}
+
+
+def _by_gap(described: Sequence[dict[str, Any]]) -> dict[float, dict[str, Any]]:
+    """Points of a curve by their mean gap between packets in steps; of equal ones the last."""
+    return {point["d"] if "d" in point else 1 / point["p"]: point for point in described}
 
 
 def _probability(gap: float) -> float:

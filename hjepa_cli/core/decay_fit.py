@@ -72,7 +72,8 @@ class Trial:
         scores = ratio(trial.shares(_oracle(kind, devices * len(grid)), true_state), trial.teacher)
         tolerated = float(first_crossing(grid, scores, trial.level, log=False))
         tolerated = float(np.clip(tolerated, grid[min(1, len(grid) - 1)], grid[-1]))
-        return dataclasses.replace(trial, gaps=np.maximum(np.array(AROUND) * tolerated, 1.0))
+        gaps = np.clip(np.array(AROUND) * tolerated, 1.0, steps)
+        return dataclasses.replace(trial, gaps=gaps)
 
     def first(self, devices: int) -> "Trial":
         """The same with fewer devices, or as many as there are."""

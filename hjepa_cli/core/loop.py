@@ -172,16 +172,16 @@ def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
 def packets_per_step(gap_steps: npt.ArrayLike, scored_steps: int, warmup_steps: int) -> Floats:
     """Return how many packets a loop under :func:`gap_schedule` sends per scored step.
 
-    It is 1/D in steady state, and 1/D + 1/K where the K scored steps begin with the loop, since
-    everybody is heard once at step 0 whatever its phase.
+    It is 1/D in steady state, and 1/D + (1 − 1/D)/K where the K scored steps begin with the loop,
+    since everybody is heard once at step 0 whatever its phase.
 
     Args:
         gap_steps: D ≥ 1.
         scored_steps: K.
         warmup_steps: unscored steps before them.
     """
-    at_start = 0.0 if warmup_steps else 1.0 / scored_steps
-    return np.minimum(1.0 / np.asarray(gap_steps, np.float64) + at_start, 1.0)
+    periodic = 1.0 / np.asarray(gap_steps, np.float64)
+    return periodic if warmup_steps else periodic + (1.0 - periodic) / scored_steps
 
 
 def delivery_schedule(probability: float, delivery: Floats) -> Bools:
@@ -309,10 +309,11 @@ class World:
 
     @property
     def lost(self) -> Bools:
-        """Whether each loop's state alone costs as much as a step can: a fallen pole [N].
+        """Whether each loop's state, as it is now, costs as much as a step can [N].
 
         The stage cost is capped (:data:`~hjepa_cli.core.metrics.COST_CAP`) where control has lost
-        the device; a cart-pole of plant desktop reaches the cap at an angle of 1.58 rad.
+        the device: a cart-pole of plant desktop whose pole leans by more than 1.58 rad, or whose
+        cart is further than 1.58 m away.
         """
         at_rest = self._plant.no_force(len(self.states))
         return np.asarray(self._plant.cost(self.states, at_rest) >= COST_CAP)

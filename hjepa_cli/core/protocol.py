@@ -124,7 +124,8 @@ class Search:
     """Finds the crossing of one curve: asks for points, takes their outcomes, until content.
 
     The grid's values from few devices guide the search. Whatever decides the result is measured
-    with many: both ends of the final bracket, and the points that the interval needs.
+    with many: both ends of the final bracket, and points outside the interval. Where few devices
+    are many already, the grid has these, and the interval's ends lie on lines between its points.
 
     Args:
         kind: see :class:`Point`.

@@ -388,14 +388,16 @@ class _Measured:
 
     def entry(self, name: str) -> Entry:
         """What ``eval --json`` prints about a method."""
-        [alone] = self._workers.results([self._submit(LeftAlone(name, *self._rollouts))])
+        waited = [self._submit(LeftAlone(name, *self._rollouts))]
+        [alone] = self._workers.results(waited, self._bench.tick)
         assert isinstance(alone, Alone)
         with self._lock:  # with every packet a family plays the same
             if alone.family not in self._every_packet:
                 unit = WithEveryPacket(name, *self._rollouts)
                 self._every_packet[alone.family] = self._submit(unit)
         curves_of = self._bench.entry(alone)
-        [every] = self._workers.results([self._every_packet[alone.family]])
+        waited = [self._every_packet[alone.family]]
+        [every] = self._workers.results(waited, self._bench.tick)
         seed, replicates = self._settings.seed, self._settings.protocol.bootstrap
         return {
             **control_entry(alone.errors, every, replicates, seed),

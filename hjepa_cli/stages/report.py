@@ -22,7 +22,7 @@ Result = dict[str, Any]
 Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
-STAGES = ("train-encoder", "train-hierarchy", "eval", "scale")
+STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale")
 FIGURE_FORMATS = ("pdf", "svg", "png")
 SMOKE = "smoke"
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
@@ -94,6 +94,10 @@ def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") 
         if not found:
             raise MissingInputError("no finished run in runs/", hint="hjepa scale")
     known = [directory for directory in dict.fromkeys(found) if stage_of(directory) in STAGES]
+    if not known:
+        raise MissingInputError(
+            f"{', '.join(map(str, found))}: no run of {', '.join(STAGES)}", hint="hjepa eval"
+        )
     return sorted(known, key=lambda directory: -STAGES.index(stage_of(directory)))
 
 
@@ -231,6 +235,31 @@ def hierarchy_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> l
         html.table(
             ["steps since the packet", f"NMAE of {result.get('method', 'hjepa')}"],
             [[window, float(error)] for window, error in result["nmae_windows"].items()],
+        ),
+    ]
+
+
+def reflex_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
+    """How the forces of decaying holds fade, and what all reflexes do after one packet."""
+    decays = {"hold-decay": result["reflex"], "hold-decay-linear": result["reflex"]["law"]}
+    windows = list(next(iter(result["nmae_windows"].values())))
+    return [
+        html.paragraph(
+            f"Reflexes, {result['checkpoint']}, trained in {result['seconds']:.0f} s: error of the "
+            f"force (NMAE) by steps since a single packet, {result['n_rollouts']} rollouts; factor "
+            "s and time τ of the forces that fade."
+        ),
+        html.table(
+            ["method", *(f"{window} steps" for window in windows), "s", "τ [steps]"],
+            [
+                [
+                    name,
+                    *(f"{errors[window]:.4f}" for window in windows),
+                    _two_decimals(decays.get(name, {}).get("gain")),
+                    _two_decimals(decays.get(name, {}).get("tau_steps")),
+                ]
+                for name, errors in result["nmae_windows"].items()
+            ],
         ),
     ]
 
@@ -388,6 +417,7 @@ def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Pat
 SECTIONS: dict[str, tuple[Callable[..., list[str]], Callable[..., Figures]]] = {
     "train-encoder": (encoder_section, training_figures),
     "train-hierarchy": (hierarchy_section, training_figures),
+    "train-reflex": (reflex_section, training_figures),
     "eval": (eval_section, eval_figures),
     "scale": (scale_section, scale_figures),
 }

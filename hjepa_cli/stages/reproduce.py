@@ -50,7 +50,8 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
         if settings.preset == report.SMOKE:
             screen.say(report.NO_RESULT)
         for name in left_out(settings):
-            screen.say(f"{name} left out, no model of it is trained here")
+            how = how_to_train(name, settings)
+            screen.say(f"{name} left out, no model of it is trained here: {how}")
         work = stages(settings, screen, folder)
         parts = plan.reproduce_parts(settings)
         expected_s = {name: round(seconds) for name, (_, seconds) in parts.items()}

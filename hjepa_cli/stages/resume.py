@@ -12,9 +12,15 @@ from hjepa_cli import __version__, plan, torchrun
 from hjepa_cli.checks import check_settings
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.settings import Settings
 from hjepa_cli.storage.datasets import MANIFEST, load_dataset
-from hjepa_cli.storage.runs import CONFIG, RESULT, read_environment, version_of
+from hjepa_cli.storage.runs import (
+    CONFIG,
+    RESULT,
+    load_recorded,
+    read_environment,
+    version_of,
+)
 from hjepa_cli.storage.shards import LOG, remove_log
 
 STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale", "reproduce")
@@ -161,7 +167,7 @@ def recall(directory: Path, screen: Screen) -> tuple[str, Settings, dict[str, An
         )
     made_by = version_of(found) or __version__
     try:
-        settings = load_settings(_preset(found, directory), directory / CONFIG)
+        settings = load_recorded(_preset(found, directory), directory)
         check_settings(settings)
     except UsageError as error:
         if made_by == __version__:

@@ -5,6 +5,7 @@ that keeps the score acceptable, times the transmissions that fit into a slot, a
 """
 
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +64,9 @@ def run(
         radio = settings.radio
         with open_workers(BLOCK_DEVICES * settings.protocol.total_steps) as workers:
             cell = ScheduledCell(subject, screen, workers)
-            for name, scheduler in cell.find(methods, grid_db):
-                record.event("measured", method=name, scheduler=scheduler)
+            with closing(cell.find(methods, grid_db)) as found:
+                for name, scheduler in found:
+                    record.event("measured", method=name, scheduler=scheduler)
             checked_db = grid_db if radio.load_depends_on_snr else grid_db[:1]
             checks = cell.verify(methods, checked_db) if verify else []
         rows: list[Row] = [

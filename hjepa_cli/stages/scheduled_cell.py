@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future
 from typing import Any
 
@@ -44,7 +44,9 @@ class ScheduledCell:
         self._bits: dict[str, int] = {}
         self._loads: dict[Key, SupportedLoad] = {}
 
-    def find(self, methods: Sequence[str], grid_db: Sequence[float]) -> Iterator[tuple[str, str]]:
+    def find(
+        self, methods: Sequence[str], grid_db: Sequence[float]
+    ) -> Generator[tuple[str, str], None, None]:
         """Search the loads of all methods under all schedulers, as many at a time as there are
         workers; yields method and scheduler of each that is found.
         """

@@ -191,7 +191,19 @@ def open_subject(
     others = tuple(
         Subject(settings, Model.load(other, settings.device), other, data) for other in further
     )
+    for other in others:
+        if model and other.model and not on_one_encoder(model, other.model):
+            screen.say(
+                f"{other.path} is on another encoder than {path}: trainings are compared, not "
+                f"methods; {how_to_train(other.model.methods[0], settings)} trains it on this one"
+            )
     return Subject(settings, model, path, data, others)
+
+
+def on_one_encoder(first: Model, other: Model) -> bool:
+    """Whether two models say that they have one encoder; those on raw frames need none."""
+    theirs = other.metadata.get("encoder")
+    return theirs in (None, first.digest, first.metadata.get("encoder"))
 
 
 def how_to_train(method: str, settings: Settings) -> str:

@@ -208,7 +208,7 @@ def train_networks(
                 value = optimiser.step(loss, step, batch)
                 bar.advance(1, loss=value)
                 if (step + 1) % REPORT_EVERY == 0 or step + 1 == options.steps:
-                    record.metric({"network": name, "step": step + 1, "loss": value})
+                    record.metric({"level": name, "step": step + 1, "loss": value})
         network.eval()
 
 
@@ -284,6 +284,7 @@ def fit_decays(
         "fitted": {
             "gaps": wide.gaps.tolist(),
             "devices": options.fit_devices,
+            "warmup_steps": settings.protocol.warmup_steps,
             "steps": options.search_steps,
             "seed": settings.seed + decay_fit.SEARCH_SEED,
         },

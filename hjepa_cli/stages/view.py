@@ -134,7 +134,7 @@ def run(
         live: play in the terminal instead of writing a file.
 
     Raises:
-        UsageError: a method that predicts no embedding, a format we do not write, more pictures
+        UsageError: a method that the model does not hold or that sends no embedding, a format we do not write, more pictures
             per second than a GIF holds, no terminal.
         MissingInputError: no model, or a library is missing.
     """
@@ -208,7 +208,8 @@ def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) ->
         if name not in viewable:
             raise UsageError(
                 f"method '{name}' cannot be viewed with this model; "
-                f"choose from {', '.join(viewable)}"
+                f"choose from {', '.join(viewable)}",
+                hint=f"hjepa view --methods {viewable[0]}",
             )
     return subject
 

@@ -24,7 +24,7 @@ from typing import IO, Any, Self
 from hjepa_cli import __version__, torchrun
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
 from hjepa_cli.interrupts import exit_code
-from hjepa_cli.settings import dotted, load_settings
+from hjepa_cli.settings import Settings, dotted, load_settings
 from hjepa_cli.storage import files, tracking
 
 ROOT = Path("runs")
@@ -361,9 +361,21 @@ def _settings(directory: Path, recorded: Mapping[str, Any]) -> dict[str, Any]:
     values, preset = read_config(directory), recorded.get("preset")
     try:
         known = preset if isinstance(preset, str) else None
-        return load_settings(known, directory / CONFIG).as_dict()
+        return load_recorded(known, directory).as_dict()
     except UsageError:  # it has settings that this version has not: they are differences
         return values
+
+
+def load_recorded(preset: str | None, directory: Path) -> Settings:
+    """Load the settings of a run; before there was a warm-up, loops were scored from the start.
+
+    Raises:
+        As :func:`~hjepa_cli.settings.load_settings`.
+    """
+    protocol = read_config(directory).get("protocol", {})
+    scored_all = isinstance(protocol, Mapping) and "warmup_steps" not in protocol
+    flags = {"protocol.warmup_steps": 0} if scored_all else {}
+    return load_settings(preset, directory / CONFIG, flags)
 
 
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
