@@ -285,3 +285,22 @@ def test_a_reader_of_linear_embeddings_controls_as_well_as_the_teacher(
     expected = 0.01 * unmixed.T @ unmixed
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert told.filter.noise / scale == pytest.approx(expected / scale, abs=0.15)
+
+
+def test_a_filter_that_hears_nothing_for_long_can_be_corrected_again() -> None:
+    """The covariance of an unstable plant grows without end; after 3,000 steps it still inverts."""
+    grow = np.array([[1.01, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1.02, 0.1], [0.01, 0, 0.1, 1]])
+    filter_ = kalman.LinearGaussian(
+        a=grow,
+        b=np.zeros((4, 1)),
+        c=np.zeros(4),
+        process=1e-6 * np.eye(4),
+        noise=1e-6 * np.eye(4),
+        start=1e-4 * np.eye(4),
+    )
+    controls = KalmanController(filter_, np.asarray, teacher("desktop"), 20.0, 2)
+    silent, both = np.zeros(2, dtype=bool), np.ones(2, dtype=bool)
+    for _ in range(3000):
+        controls.act(silent, None)
+    seen = np.array([[0.01, 0.0, 0.02, 0.0], [0.0, 0.1, -0.03, 0.2]])
+    assert controls.act(both, seen) == pytest.approx(teacher("desktop")(seen), abs=1e-3)

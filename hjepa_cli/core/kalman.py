@@ -90,8 +90,13 @@ class KalmanController:
             )
         forces_n = self.outlook()
         actions = forces_n.reshape(len(forces_n), -1) / self._limit_n
-        mean, self._spread = self._filter.predict(self._mean, self._spread, actions)
+        mean, spread = self._filter.predict(self._mean, self._spread, actions)
         self._mean = np.clip(mean, -STATE_LIMIT, STATE_LIMIT)
+        # Seconds without a packet: beyond the loop's own limits a covariance means nothing more,
+        # and in the end no number holds it.
+        deviation = np.sqrt(np.einsum("nii->ni", spread))
+        within = np.minimum(1.0, STATE_LIMIT / deviation)
+        self._spread = within[:, :, None] * spread * within[:, None, :]
         return forces_n
 
     def outlook(self) -> Floats:

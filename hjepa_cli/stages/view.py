@@ -134,8 +134,8 @@ def run(
         live: play in the terminal instead of writing a file.
 
     Raises:
-        UsageError: a method that the model does not hold or that sends no embedding, a format we do not write, more pictures
-            per second than a GIF holds, no terminal.
+        UsageError: a method that the model does not hold or that sends no embedding, a format we
+            do not write, more pictures per second than a GIF holds, no terminal.
         MissingInputError: no model, or a library is missing.
     """
     try:
