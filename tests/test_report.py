@@ -344,3 +344,28 @@ def test_training_figure_has_a_line_per_loss_level_and_health_measure():
     levels = [{"level": name, "step": "5", "loss": "1"} for name in ("high", "low")]
     (axes,) = figures.training_figure(levels).axes
     assert [line.get_label() for line in axes.lines] == ["high", "low"]
+
+
+def test_a_run_of_reflexes_has_its_section(shell, without_figures):
+    windows = {"1-20": 0.0571, "21-40": 0.04}
+    document = {
+        "checkpoint": "r/model.safetensors",
+        "seconds": 200.0,
+        "n_rollouts": 40,
+        "reflex": {
+            "gain": 2.61,
+            "tau_steps": 6.88,
+            "law": {"gain": 1.31, "tau_steps": 9.21, "gains_n": [[-21.5, -6.2, -48.2, -3.8]]},
+        },
+        "nmae_windows": dict.fromkeys(("hold-decay", "hold-decay-linear", "chunk"), windows),
+    }
+    made = finished("train-reflex", document)
+    assert shell("report", made, "--json").code == 0
+    text = (shell.directory / "report.html").read_text()
+    for part in ("Reflexes, r/model.safetensors", "0.0571", "2.61", "9.21", "chunk"):
+        assert part in text, part
+
+
+def test_runs_that_no_report_shows_are_refused(shell):
+    made = finished("collect", {"dataset": "d"})
+    assert_one_line_error(shell("report", made), 66, "no run of train-encoder")

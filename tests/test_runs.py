@@ -327,3 +327,17 @@ def test_a_damaged_run_does_not_hide_the_others() -> None:
     assert newest_run("train-encoder", plant) == Path("runs/train-encoder/a")
     other = lambda directory: read_config(directory)["no such"]  # noqa: E731
     assert newest_run("train-encoder", other) is None
+
+
+def test_runs_of_before_there_was_a_warm_up_are_scored_from_the_start() -> None:
+    with Run.create("eval", Path("old"), SETTINGS):
+        pass
+    config = Path("old") / runs.CONFIG
+    text = (
+        config.read_text()
+        .replace("warmup_steps = 1000\n", "")
+        .replace("steps = 3000", "steps = 900")
+    )
+    config.write_text(text)
+    protocol = runs.load_recorded(None, Path("old")).protocol
+    assert (protocol.warmup_steps, protocol.steps) == (0, 900)

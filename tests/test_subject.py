@@ -252,3 +252,17 @@ def test_curves_of_a_baseline_are_complete_with_its_own_method(
     )
     curves.write(path.with_name("curves.json"), subject.digest, measured["methods"])
     assert missing_curves(zoo.verify_model("raw")) == []
+
+
+def test_a_model_on_another_encoder_is_said_to_be_one(tmp_path: Path, quick_encoder: None) -> None:
+    """A flat model that does not say that it is on the first one's encoder is none of its."""
+    shipped = untrained(tmp_path / "zoo" / "hierarchy" / "model.safetensors")
+    deeper = flat(5)
+    output, settings = Output(), small(methods=("hjepa", "ts-jepa-5"))
+    open_subject(settings, output.screen, str(shipped), None)
+    assert "another encoder" not in output.stderr.getvalue()  # it says nothing of its encoder
+    kept = zoo.load_checkpoint(deeper)
+    save_checkpoint(deeper, kept.tensors, {**kept.metadata, "encoder": "0" * 64})
+    open_subject(settings, output.screen, str(shipped), None)
+    assert f"{deeper} is on another encoder than {shipped}" in output.stderr.getvalue()
+    assert "hjepa train-hierarchy --preset smoke --h 5" in output.stderr.getvalue()
