@@ -5,13 +5,13 @@ the count beside the bits that control needs in theory. The rows are those of ``
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from hjepa_cli.checks import split_late
+from hjepa_cli.checks import REFLEXES, split_late
 from hjepa_cli.core.capacity import (
     Noise,
     duty_devices,
@@ -198,8 +198,18 @@ def ratio_of(above: Row, below: Row) -> Row:
 
 def best_flat(rows: Sequence[Row], snr_db: float) -> Row | None:
     """Return the row of the flat predictor (``ts-jepa-…``) with the most devices at one SNR."""
-    flat = [row for row in rows if row["snr_db"] == snr_db and row["method"].startswith("ts-jepa-")]
-    return max(flat, key=lambda row: row["devices"] or 0, default=None)
+    return _best((row for row in rows if row["method"].startswith("ts-jepa-")), snr_db)
+
+
+def best_reflex(rows: Sequence[Row], snr_db: float) -> Row | None:
+    """Return the row of the reflex with the most devices at one SNR."""
+    return _best((row for row in rows if row["method"] in REFLEXES), snr_db)
+
+
+def _best(rows: Iterable[Row], snr_db: float) -> Row | None:
+    """The row with the most devices at one SNR; ``None`` where there is none."""
+    at = (row for row in rows if row["snr_db"] == snr_db)
+    return max(at, key=lambda row: row["devices"] or 0, default=None)
 
 
 def paired_interval(pairs: Sequence[tuple[float, float]]) -> list[float]:

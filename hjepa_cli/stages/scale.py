@@ -13,7 +13,7 @@ from typing import Any
 
 from hjepa_cli.checks import RAW_FRAMES, late
 from hjepa_cli.core.capacity import late_slots, parse_snr, slot_capacity
-from hjepa_cli.core.cell import Cell, Need, Row, best_flat, gain
+from hjepa_cli.core.cell import Cell, Need, Row, best_flat, best_reflex, gain
 from hjepa_cli.core.methods import FRAME_BITS
 from hjepa_cli.core.plant import plant
 from hjepa_cli.errors import NumericalError
@@ -159,9 +159,9 @@ def timed(method: str, cell: Cell, snr_db: float) -> str:
 
 
 def gains(rows: Sequence[Row], snr_db: float) -> list[Row]:
-    """``hjepa`` over one-step TS-JEPA, the best flat predictor, hold and the oracle."""
-    flat = best_flat(rows, snr_db)
-    rivals = dict.fromkeys(["ts-jepa-1", *([flat["method"]] if flat else []), "hold", "oracle"])
+    """``hjepa`` over one-step TS-JEPA, the best flat predictor and reflex, hold and the oracle."""
+    best = [row["method"] for row in (best_flat(rows, snr_db), best_reflex(rows, snr_db)) if row]
+    rivals = dict.fromkeys(["ts-jepa-1", *best, "hold", "oracle"])
     return [found for rival in rivals if (found := gain(rows, "hjepa", rival, snr_db))]
 
 
