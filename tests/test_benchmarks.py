@@ -228,6 +228,8 @@ def test_a_study_of_sizes_is_drawn(tmp_path: Path) -> None:
             "nmae_windows_ci95": {window: [0.0, 1.0] for window in windows},
             "tolerance_gap_steps": 180.0,
             "tolerance_gap_ci95": [170.0, 190.0],
+            "tolerance_p": 0.0105,
+            "tolerance_p_ci95": [0.009, 0.012],
         }
         health = {"probe_r2": dict.fromkeys(study.PROBES, r2), "actor_nrmse": 0.06}
         return {"health": health, "methods": {"hjepa": entry}}

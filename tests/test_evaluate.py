@@ -62,7 +62,7 @@ def small(
         "steps": 24,
         "curve_devices": 3,
         "bracket_devices": 4,
-        "gaps": (1, 8),
+        "gaps": (1, min(8, changes.get("steps", 24))),
         "bracket": 0.5,
         "horizon": 24,
         "bootstrap": 40,

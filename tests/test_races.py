@@ -51,7 +51,7 @@ def test_evaluations_that_share_a_file_of_curves_lose_none(tmp_path: Path) -> No
         import sys
         from pathlib import Path
         from hjepa_cli.storage import curves
-        curves.flaw = lambda entry: None  # the entries here are no real ones
+        curves.flaw = lambda entry, complete: None  # the entries here are no real ones
         digest = curves.Digest("0" * 64, "1" * 64)
         for number in range(20):
             curves.write(Path(sys.argv[1]), digest, {f"{sys.argv[2]}{number}": {"score": 1}})

@@ -48,6 +48,7 @@ flat_steps = 2
 medium_steps = 2
 low_steps = 2
 [protocol]
+warmup_steps = 0
 steps = 20
 curve_devices = 2
 bracket_devices = 2

@@ -24,9 +24,11 @@ FRESH_SEED = 20_000  # trajectories that no training has seen
 pytestmark = pytest.mark.parametrize("name", zoo.list_models())
 
 
-def settings_of(model):
+def settings_of(model, card):
     preset = model.metadata["settings"]["preset"]
     flags = {"protocol.curve_devices": DEVICES, "protocol.bracket_devices": DEVICES}
+    if "--protocol paper" in card:
+        flags["protocol"] = "paper"
     return load_settings(preset, flags=flags)
 
 
@@ -97,7 +99,7 @@ def test_the_card_says_what_the_curves_say(name):
 def test_a_few_devices_score_as_on_the_card(name):
     """Their mean lies within three standard errors, those of the card's interval and its n."""
     model, rows = load(name), rows_of(card_of(name))
-    settings = settings_of(model)
+    settings = settings_of(model, card_of(name))
     simulator = Simulator(settings, model)
 
     def scores(method, gap):

@@ -134,7 +134,7 @@ def read(path: Path, digest: Digest) -> dict[str, Entry]:
     if document.get("digest") != digest.as_dict():
         return {}
     for name, entry in document["methods"].items():
-        if reason := flaw(entry, complete=True):
+        if reason := flaw(entry, complete=digest.loop_version == LOOP_VERSION):
             raise _damaged(path, f"method '{name}': {reason}")
     return {
         name: entry
