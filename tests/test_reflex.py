@@ -362,7 +362,7 @@ def test_a_run_says_what_it_found_and_repeats_to_the_last_bit(
     assert said["fitted"]["seed"] == decay_fit.SEARCH_SEED
     assert result["nmae_windows"].keys() == set(REFLEXES)
     rows = (workplace / "run" / "metrics.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows] == ["network", "chunk", "chunk_forces"]
+    assert [row.split(",")[0] for row in rows] == ["level", "chunk", "chunk_forces"]
 
 
 def test_encoder_and_actor_are_the_models(workplace: Path) -> None:
