@@ -114,7 +114,7 @@ def test_a_few_devices_score_as_on_the_card(name):
         n = entries[method]["n_curve_devices"]
         standard_error = (high - low) / (2 * 1.96) * np.sqrt(n / DEVICES)
         measured = float(ratio(scores(method, gap_steps), teacher[0])[0])
-        assert abs(measured - score) < 3 * standard_error, (method, measured)
+        assert abs(measured - score) <= 3 * standard_error, (method, measured)
         assert (
             build_method(method, settings, model).bits_per_transmission
             == (entries[method]["bits_per_transmission"])
