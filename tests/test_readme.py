@@ -2,6 +2,7 @@
 
 import importlib.machinery
 import importlib.util
+import json
 import re
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 from command_line import ROOT, open_shell
 from test_zoo_numbers import agree, numbers
 
+from hjepa_cli.core.metrics import student_interval
+from hjepa_cli.stages.compare import differences
 from hjepa_cli.storage import files, zoo
 
 MODEL = "desktop-h4m2l1"
@@ -79,6 +82,23 @@ def test_scores_in_the_text_are_those_of_the_curves():
             point = curve[float(gap_steps)]
             score, ratio = cell.split(" / ")
             assert agree(score, point["score"]) and agree(ratio, point["lq_ratio"]), (method, cell)
+
+
+def test_the_five_trainings_are_what_was_measured():
+    """README's table from the results that are kept, by the rules of the study."""
+    kept = json.loads((ROOT / "docs/results/five_trainings.json").read_text())["methods"]
+    assert all(len(by_seed) == 5 for by_seed in kept.values())
+    found = {one["over"]: one for one in differences(kept, left_out=())}
+    header, gap = "| method | gap D* [ms] | delivery p* | D* of", "gap D* [ms]"
+    over_gap, over_p = "D* of `hjepa` ÷ its", "its p* ÷ that of `hjepa`"
+    for method, row in rows(TEXT, header).items():
+        for column, key in ((gap, "tolerance_gap_steps"), ("delivery p*", "tolerance_p")):
+            values = np.array([entry[key] for entry in kept[method].values()])
+            assert agree(row[column], values.mean(), *student_interval(values)), (method, column)
+        for column, key in ((over_gap, "tolerance_gap_ratio"), (over_p, "tolerance_p_ratio")):
+            if method != "hjepa":
+                ratio = found[method][key]
+                assert agree(row[column].strip("*"), ratio["mean"], *ratio["ci95"]), method
 
 
 def test_eval_and_report_in_an_empty_directory(shell):
