@@ -7,6 +7,7 @@ whole batch, whatever their number; only the order of the sums differs.
 
 import dataclasses
 import datetime
+import importlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -123,6 +124,9 @@ def joined(device: torch.device, items: int) -> Iterator[Ranks]:
                 hint=f"torchrun --nproc-per-node {there}, or --device cpu",
             )
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    # The optimiser's first step imports this, and what it imports keeps the process group that it
+    # finds. The group's threads then outlive it, and some ends of the interpreter abort on them.
+    importlib.import_module("torch._dynamo")
     # Counts and codes are exchanged on the CPU, whatever the device.
     backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
     dist.init_process_group(backend, timeout=TIMEOUT)
