@@ -12,13 +12,13 @@ import math
 
 import numpy as np
 
-from hjepa_cli.core.fading import gilbert_elliott
-from hjepa_cli.core.loop import Draws, every_step, simulate
-from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.metrics import bootstrap_weights, first_crossing, interval, ratio
-from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant
-from hjepa_cli.settings import load_settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.loop import Draws, every_step, simulate
+from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.radio.fading import gilbert_elliott
+from hjepa_cli.core.statistics import bootstrap_weights, first_crossing, interval, ratio
 from hjepa_cli.storage import zoo
 
 

@@ -11,10 +11,10 @@ import argparse
 
 import numpy as np
 
-from hjepa_cli.core.bench import Bench
-from hjepa_cli.core.protocol import Point
-from hjepa_cli.core.simulator import Simulator
-from hjepa_cli.settings import load_settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.evaluation.bench import Bench
+from hjepa_cli.core.evaluation.protocol import Point
+from hjepa_cli.core.evaluation.simulator import Simulator
 
 METHODS = ("oracle", "hold-true", "zero-true")
 

@@ -14,13 +14,13 @@ import time
 
 import numpy as np
 
-from hjepa_cli.core.cell_loop import measure_growth, simulate_cell
-from hjepa_cli.core.fading import block_fading
-from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.uplink import Access
-from hjepa_cli.settings import load_settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.evaluation.cell_simulation import measure_growth, simulate_cell
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.radio.fading import block_fading
+from hjepa_cli.core.radio.uplink import Access
 from hjepa_cli.storage import zoo
 
 

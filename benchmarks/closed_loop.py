@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from hjepa_cli.checks import ANCHORS, TRUE_STATE
-from hjepa_cli.core.camera import Camera
-from hjepa_cli.core.model import Model, build_modules
-from hjepa_cli.core.plant import CartPoles, plant
-from hjepa_cli.core.protocol import Point
-from hjepa_cli.core.simulator import Simulator, run_points
-from hjepa_cli.settings import Settings, load_settings
+from hjepa_cli.config.checks import ANCHORS, TRUE_STATE
+from hjepa_cli.config.settings import Settings, load_settings
+from hjepa_cli.core.evaluation.protocol import Point
+from hjepa_cli.core.evaluation.simulator import Simulator, run_points
+from hjepa_cli.core.networks.model import Model, build_modules
+from hjepa_cli.core.plants.cartpole.simulation import CartPoles
+from hjepa_cli.core.plants.named import Camera, plant
 from hjepa_cli.stages.train_encoder import describe_architecture
 from hjepa_cli.storage import runs, zoo
 

@@ -26,16 +26,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from hjepa_cli import data, models
-from hjepa_cli.checks import check_settings
-from hjepa_cli.core.cell import Cell, Need
-from hjepa_cli.core.model import Model, build_modules, tensors_of
-from hjepa_cli.core.training import Optimiser
+from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.datasets import dataset as datasets
+from hjepa_cli.core.evaluation import curves
+from hjepa_cli.core.evaluation.cell import Cell, Need
+from hjepa_cli.core.networks.model import Model, build_modules, tensors_of
+from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.errors import HjepaError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import load_settings
-from hjepa_cli.stages import progress
-from hjepa_cli.storage import curves, datasets, files, runs, shards, tensors
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages import data, models, progress
+from hjepa_cli.storage import files, runs, shards, tensors
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 
 SLOWEST_S = 5.0

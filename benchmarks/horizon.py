@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.settings import load_settings
+from hjepa_cli.config.settings import load_settings
 
 
 def main() -> None:

@@ -6,7 +6,7 @@
 Every stage runs in a child process of its own and is killed right before one of its calls that
 touch the disk, drawn among all of them. Between two such calls a kill finds the same disk at any
 time, so these are all the moments there are (but for those inside a single write, of which
-tests/test_files.py takes care), and they do not depend on the machine's speed. After each kill,
+tests/storage/test_files.py takes care), and they do not depend on the machine's speed. After each kill,
 every file that is there under its own name must load; then the same command is given again, in the
 end ``hjepa resume``. Datasets, checkpoints, ``metrics.csv``, curves and tables must be the bytes of
 a run that was not killed, and no other file may be left. Prints kills, and how many came during a
@@ -32,8 +32,10 @@ from typing import Any
 
 import torch
 
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import load_settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.datasets import dataset as datasets
+from hjepa_cli.core.datasets.dataset import load_dataset
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import (
     collect,
     evaluate,
@@ -43,9 +45,8 @@ from hjepa_cli.stages import (
     train_encoder,
     train_hierarchy,
 )
-from hjepa_cli.storage import datasets, files
+from hjepa_cli.storage import files
 from hjepa_cli.storage.checkpoints import load_checkpoint
-from hjepa_cli.storage.datasets import load_dataset
 from hjepa_cli.storage.runs import CONFIG, METRICS, RESULT
 from hjepa_cli.storage.shards import LOG
 
@@ -150,7 +151,11 @@ def context() -> BaseContext:
     chosen = multiprocessing.get_context("forkserver")
     stages = ("collect", "train_encoder", "train_hierarchy", "evaluate", "scale")
     chosen.set_forkserver_preload(
-        ["hjepa_cli.figures", "torch._dynamo", *(f"hjepa_cli.stages.{name}" for name in stages)]
+        [
+            "hjepa_cli.output.figures",
+            "torch._dynamo",
+            *(f"hjepa_cli.stages.{name}" for name in stages),
+        ]
     )
     first = chosen.Process(target=bool)  # not to be timed: it imports everything
     first.start()

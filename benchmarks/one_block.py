@@ -16,15 +16,15 @@ import math
 import numpy as np
 from scipy import stats
 
-from hjepa_cli.core.cell_loop import measure_growth, simulate_cell
-from hjepa_cli.core.load_simulator import CALIBRATION_SEED
-from hjepa_cli.core.loop import Draws, every_step, simulate
-from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.schedulers import SCHEDULERS, drift_plus_penalty
-from hjepa_cli.core.uplink import Access
-from hjepa_cli.settings import load_settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.loop import Draws, every_step, simulate
+from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.evaluation.cell_simulation import measure_growth, simulate_cell
+from hjepa_cli.core.evaluation.load_simulator import CALIBRATION_SEED
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.radio.schedulers import SCHEDULERS, drift_plus_penalty
+from hjepa_cli.core.radio.uplink import Access
 from hjepa_cli.storage import zoo
 
 GIVEN_UP = 0.3

@@ -22,8 +22,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
-from hjepa_cli.core.seeding import generator
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.named import Camera
 
 LEAST_RATIO = 10.0
 RANGES = np.array([1.0, 0.5, 0.2, 0.5])

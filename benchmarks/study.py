@@ -32,9 +32,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hjepa_cli import figures
-from hjepa_cli.core.loop import LOOP_VERSION
-from hjepa_cli.core.metrics import student_interval
+from hjepa_cli.core.control.loop import LOOP_VERSION
+from hjepa_cli.core.statistics import student_interval
+from hjepa_cli.output import figures
 from hjepa_cli.stages.compare import differences
 
 STUDIES = Path(__file__).parent / "studies"

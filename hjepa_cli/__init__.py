@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Camera": "hjepa_cli.core.camera",
-    "CartPole": "hjepa_cli.core.plant",
-    "Model": "hjepa_cli.core.model",
+    "Camera": "hjepa_cli.core.plants.named",
+    "CartPole": "hjepa_cli.core.plants.named",
+    "Model": "hjepa_cli.core.networks.model",
     "collect": "hjepa_cli.api",
     "drive": "hjepa_cli.api",
     "evaluate": "hjepa_cli.api",
     "load_dataset": "hjepa_cli.api",
     "load_model": "hjepa_cli.api",
-    "load_settings": "hjepa_cli.settings",
+    "load_settings": "hjepa_cli.config.settings",
     "predict": "hjepa_cli.api",
     "scale": "hjepa_cli.api",
     "simulate_cell": "hjepa_cli.api",
-    "teacher": "hjepa_cli.core.policy",
+    "teacher": "hjepa_cli.core.plants.named",
     "train_encoder": "hjepa_cli.api",
     "train_hierarchy": "hjepa_cli.api",
     "train_reflex": "hjepa_cli.api",
@@ -42,11 +42,9 @@ if TYPE_CHECKING:
         train_hierarchy,
         train_reflex,
     )
-    from hjepa_cli.core.camera import Camera
-    from hjepa_cli.core.model import Model
-    from hjepa_cli.core.plant import CartPole
-    from hjepa_cli.core.policy import teacher
-    from hjepa_cli.settings import load_settings
+    from hjepa_cli.config.settings import load_settings
+    from hjepa_cli.core.networks.model import Model
+    from hjepa_cli.core.plants.named import Camera, CartPole, teacher
 
 __all__ = [
     "Camera",

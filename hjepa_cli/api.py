@@ -13,25 +13,25 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from hjepa_cli.checks import check_count, check_schedulable
-from hjepa_cli.command import resolve
-from hjepa_cli.core import cell_loop
-from hjepa_cli.core.conditions import actual_plant
-from hjepa_cli.core.load_simulator import CALIBRATION_SEED
-from hjepa_cli.core.loop import Draws, delivery_schedule, gap_schedule, simulate
-from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.model import Model
-from hjepa_cli.core.uplink import Access
+from hjepa_cli.config.checks import check_count, check_schedulable
+from hjepa_cli.config.resolve import resolve
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.loop import Draws, delivery_schedule, gap_schedule, simulate
+from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.datasets import dataset as datasets
+from hjepa_cli.core.evaluation import cell_simulation as cell_loop
+from hjepa_cli.core.evaluation.load_simulator import CALIBRATION_SEED
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.plants.conditions import actual_plant
+from hjepa_cli.core.radio.uplink import Access
 from hjepa_cli.errors import UsageError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
-from hjepa_cli.storage import datasets, zoo
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.storage import zoo
 
 Values = Mapping[str, Any]
-Floats = NDArray[np.float64]
 
 
 def load_model(name_or_path: str | Path, *, device: str = "cpu") -> Model:

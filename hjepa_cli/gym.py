@@ -20,14 +20,14 @@ except ModuleNotFoundError as missing:
     ) from None
 from gymnasium import spaces
 
-from hjepa_cli.checks import check_count
-from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX, Camera
-from hjepa_cli.core.loop import STATE_LIMIT, noise_per_step
-from hjepa_cli.core.metrics import COST_CAP
-from hjepa_cli.core.plant import CartPole
-from hjepa_cli.core.seeding import generator
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.checks import check_count
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.loop import STATE_LIMIT, noise_per_step
+from hjepa_cli.core.plants.cost import COST_CAP
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.named import Camera, CartPole
 from hjepa_cli.errors import NumericalError, UsageError
-from hjepa_cli.settings import load_settings
 
 Observation = NDArray[Any]
 REWARDS = ("lq", "score")
@@ -171,7 +171,7 @@ class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any]):
     Args:
         env: any environment.
         delivery_probability: p, of each observation, independently. For a Rayleigh-fading link,
-            1 - ``hjepa_cli.core.channel.outage_probability(rate_bps, bandwidth_hz, snr_db)``.
+            1 - ``hjepa_cli.core.radio.channel.outage_probability(rate_bps, bandwidth_hz, snr_db)``.
 
     Raises:
         UsageError: p outside 0 … 1.

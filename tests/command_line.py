@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from hjepa_cli.cli import main
+from hjepa_cli.cli.app import main
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "HJEPA_DEBUG": "0"}  # for child processes

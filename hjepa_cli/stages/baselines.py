@@ -11,14 +11,15 @@ from typing import Any
 import torch
 from torch import nn
 
-from hjepa_cli.core import health
-from hjepa_cli.core.actor import Actor
-from hjepa_cli.core.decoder import Decoder
-from hjepa_cli.core.encoder import Encoder
-from hjepa_cli.core.frame_policies import Imitation, Reconstruction, read_frames
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.training import autocast, resolve_device
-from hjepa_cli.settings import Settings
+from hjepa_cli.compute.device import autocast, resolve_device
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.actor import Actor
+from hjepa_cli.core.networks.decoder import Decoder
+from hjepa_cli.core.networks.encoder import Encoder
+from hjepa_cli.core.networks.read_frames import read_frames
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.stages.frame_training import Training, standardisation_sample
 from hjepa_cli.stages.inputs import RenderedSplit, embed
 
@@ -27,7 +28,7 @@ LOOK_FRAMES = 500  # of them, for the reconstruction error
 
 
 def describe_architecture(settings: Settings) -> dict[str, Any]:
-    """What :func:`~hjepa_cli.core.model.build_modules` needs, as it goes into the checkpoint."""
+    """What :func:`~hjepa_cli.core.networks.model.build_modules` needs, as it goes into the checkpoint."""
     encoder, actor = settings.encoder, settings.actor
     return {
         "kind": encoder.method,

@@ -17,19 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from hjepa_cli.checks import check_settings
-from hjepa_cli.core.camera import HEIGHT_PX, WIDTH_PX
-from hjepa_cli.core.conditions import altered
-from hjepa_cli.core.executors import MAX_WORKERS, cores, finished, open_executor
-from hjepa_cli.core.payload import raw_frame_bits
-from hjepa_cli.core.plant import plant, plant_of
-from hjepa_cli.core.system import Camera
-from hjepa_cli.core.trajectories import generate, split_sizes
-from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
-from hjepa_cli.interrupts import exit_code
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings, dotted, load_settings
-from hjepa_cli.storage.datasets import (
+from hjepa_cli.compute.executors import MAX_WORKERS, cores, finished, open_executor
+from hjepa_cli.compute.interrupts import exit_code
+from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.settings import Settings, dotted, load_settings
+from hjepa_cli.core.control.payload import raw_frame_bits
+from hjepa_cli.core.datasets.dataset import (
     MANIFEST,
     Dataset,
     Trajectories,
@@ -39,6 +32,13 @@ from hjepa_cli.storage.datasets import (
     write_manifest,
     write_shard,
 )
+from hjepa_cli.core.datasets.trajectories import generate, split_sizes
+from hjepa_cli.core.plants.conditions import altered
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.named import plant, plant_of
+from hjepa_cli.core.plants.system import Camera
+from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.storage.files import check_free_space, point_to
 from hjepa_cli.storage.shards import (
     LOG,

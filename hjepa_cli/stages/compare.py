@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from hjepa_cli.checks import METHODS, TRUE_STATE, check_methods
-from hjepa_cli.core.metrics import student_interval
-from hjepa_cli.core.plant import plant
+from hjepa_cli.config.checks import METHODS, TRUE_STATE, check_methods
+from hjepa_cli.core.evaluation import curves
+from hjepa_cli.core.evaluation.curves import Entry
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.statistics import student_interval
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen, span, tolerance
+from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.stages.report import (
     FIGURE_FORMATS,
     NO_RESULT,
@@ -28,8 +30,7 @@ from hjepa_cli.stages.report import (
     inputs_of,
     stage_of,
 )
-from hjepa_cli.storage import curves, runs
-from hjepa_cli.storage.curves import Entry
+from hjepa_cli.storage import runs
 
 AVERAGED = {  # of an entry of ``eval --json``, where the interval of it goes, and its range
     "nmae": ("nmae_ci95", (0.0, None)),
@@ -441,8 +442,8 @@ def draw(
     document: Mapping[str, Any], directory: Path, formats: Sequence[str], screen: Screen
 ) -> list[Path]:
     """Write the paper's Fig. 3, bands over trainings, as ``trainings.<format>``."""
-    from hjepa_cli.comparison import comparison_figure
-    from hjepa_cli.figures import save
+    from hjepa_cli.output.comparison import comparison_figure
+    from hjepa_cli.output.figures import save
     from hjepa_cli.storage.files import make_directory
 
     drawn = comparison_figure(

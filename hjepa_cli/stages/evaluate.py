@@ -14,23 +14,24 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import TRUE_STATE, check_gaps, check_methods, split_late
-from hjepa_cli.core.bench import Bench, control_entry
-from hjepa_cli.core.control_errors import Alone, LeftAlone, WithEveryPacket
-from hjepa_cli.core.loop import LOOP_VERSION
-from hjepa_cli.core.metrics import BESIDE, WINDOWS
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.protocol import Point
-from hjepa_cli.core.simulator import Simulator
-from hjepa_cli.core.system import Floats
-from hjepa_cli.core.trajectories import generate
-from hjepa_cli.core.workers import Workers, open_workers
+from hjepa_cli.config.checks import TRUE_STATE, check_gaps, check_methods, split_late
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.force_error import WINDOWS
+from hjepa_cli.core.control.loop import LOOP_VERSION
+from hjepa_cli.core.datasets.trajectories import generate
+from hjepa_cli.core.evaluation import curves
+from hjepa_cli.core.evaluation.bench import Bench, control_entry
+from hjepa_cli.core.evaluation.control_errors import Alone, LeftAlone, WithEveryPacket
+from hjepa_cli.core.evaluation.curves import Entry
+from hjepa_cli.core.evaluation.protocol import BESIDE, Point
+from hjepa_cli.core.evaluation.simulator import Simulator
+from hjepa_cli.core.evaluation.workers import Workers, open_workers
+from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.screen import Screen, described_steps, in_order, ticking, tolerance
-from hjepa_cli.settings import Settings
-from hjepa_cli.stages.subject import Subject, how_to_train, open_subject
-from hjepa_cli.storage import curves, runs
-from hjepa_cli.storage.curves import Entry
+from hjepa_cli.output.screen import Screen, described_steps, in_order, ticking, tolerance
+from hjepa_cli.stages.model_set import Subject, how_to_train, open_subject
+from hjepa_cli.storage import runs
 from hjepa_cli.storage.runs import Run
 from hjepa_cli.storage.zoo import CURVES_FILE
 
@@ -113,8 +114,8 @@ def open_measurable(
 
 def draw(result: dict[str, Any], settings: Settings, directory: Path, screen: Screen) -> list[Path]:
     """Write the paper's Fig. 3 as ``comparison.png``, ``.svg`` and ``.pdf``."""
-    from hjepa_cli.comparison import comparison_figure
-    from hjepa_cli.figures import save
+    from hjepa_cli.output.comparison import comparison_figure
+    from hjepa_cli.output.figures import save
 
     drawn = comparison_figure(
         result["methods"],

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hjepa_cli.core.batches import FrameWindows, TrajectoryBatch
-from hjepa_cli.core.history import frames_seen
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.ranks import ALONE, Ranks
-from hjepa_cli.core.seeding import generator
-from hjepa_cli.core.training import Optimiser, autocast, resolve_device
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
+from hjepa_cli.compute.device import autocast, resolve_device
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.plants.frames import frames_seen
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.training.batches import FrameWindows, TrajectoryBatch
+from hjepa_cli.core.training.optimiser import Optimiser
+from hjepa_cli.core.training.ranks import ALONE, Ranks
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.inputs import RenderedSplit, labels_of
 from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.runs import Run

@@ -14,28 +14,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hjepa_cli import __version__
-from hjepa_cli.core.batches import Labels, shift_sideways
-from hjepa_cli.core.conditions import vary
-from hjepa_cli.core.history import frames_seen
-from hjepa_cli.core.memory import keep_freed_memory
-from hjepa_cli.core.model import encode_frames
-from hjepa_cli.core.plant import plant, plant_of
-from hjepa_cli.core.ranks import ALONE, Ranks
-from hjepa_cli.core.system import System, same_camera
-from hjepa_cli.core.training import resolve_device
-from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
-from hjepa_cli.stages.progress import Progress
-from hjepa_cli.storage.datasets import (
+from hjepa_cli.compute.device import resolve_device
+from hjepa_cli.compute.memory import keep_freed_memory
+from hjepa_cli.compute.torchrun import ContactLost
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.datasets.dataset import (
     Dataset,
     Trajectories,
     find_newest_dataset,
     load_dataset,
 )
+from hjepa_cli.core.networks.model import encode_frames
+from hjepa_cli.core.plants.conditions import vary
+from hjepa_cli.core.plants.frames import frames_seen
+from hjepa_cli.core.plants.named import plant, plant_of
+from hjepa_cli.core.plants.system import System, same_camera
+from hjepa_cli.core.training.batches import Labels, shift_sideways
+from hjepa_cli.core.training.ranks import ALONE, Ranks
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.files import canonical_json
 from hjepa_cli.storage.runs import Run
-from hjepa_cli.torchrun import ContactLost
 
 CHUNK = 20  # trajectories rendered or encoded at a time: progress shows, memory stays small
 

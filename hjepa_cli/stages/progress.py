@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hjepa_cli.core.ranks import ALONE, Ranks
+from hjepa_cli.compute.interrupts import Postponed
+from hjepa_cli.core.training.ranks import ALONE, Ranks
 from hjepa_cli.errors import DataError
-from hjepa_cli.interrupts import Postponed
-from hjepa_cli.screen import Screen
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 from hjepa_cli.storage.runs import Run
 

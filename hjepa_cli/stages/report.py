@@ -11,11 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli import __version__, html
-from hjepa_cli.core.metrics import BESIDE
-from hjepa_cli.core.plant import plant
+from hjepa_cli import __version__
+from hjepa_cli.core.evaluation.protocol import BESIDE
+from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen, described_steps, in_order, percent, span, tolerance
+from hjepa_cli.output import html
+from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
@@ -182,7 +183,7 @@ def draw(figures_of: Callable[[], Figures], screen: Screen) -> Figures:
 
 def svg(figure: Any) -> bytes:
     """A figure as SVG, equal bytes for equal figures."""
-    from hjepa_cli.figures import encoded
+    from hjepa_cli.output.figures import encoded
 
     return encoded(figure, "svg")
 
@@ -193,7 +194,7 @@ def write_figures(
     """Write figures as ``<stage>-<name>.<format>``."""
     if not drawn:
         return []
-    from hjepa_cli.figures import save
+    from hjepa_cli.output.figures import save
 
     files.make_directory(directory)
     return [
@@ -371,7 +372,7 @@ def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
     path = run / runs.METRICS
     if not path.is_file():
         return {}
-    from hjepa_cli import figures
+    from hjepa_cli.output import figures
 
     text = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode()
     rows = list(csv.DictReader(io.StringIO(text)))
@@ -382,7 +383,7 @@ def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
 
 def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
     """Score against gap and delivery, error against the horizon; none that would be empty."""
-    from hjepa_cli import figures
+    from hjepa_cli.output import figures
 
     entries = in_order(result["methods"], config["methods"])
     step_s = plant(result["plant"]).step_s
@@ -408,7 +409,7 @@ def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path
 
 def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
     """Devices against the SNR."""
-    from hjepa_cli import figures
+    from hjepa_cli.output import figures
 
     caption = f"Supported devices, law {result['law']}, 95 % intervals"
     return {"devices": (caption, figures.scale_figure(result))}

@@ -10,17 +10,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli import plan
-from hjepa_cli.checks import LINKLESS, TRUE_STATE, check_gaps, check_schedulable
-from hjepa_cli.core.capacity import parse_snr
-from hjepa_cli.core.model import offered
-from hjepa_cli.core.plant import plant
+from hjepa_cli.config.checks import LINKLESS, TRUE_STATE, check_gaps, check_schedulable
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.networks.model import offered
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.errors import UsageError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import (
     collect,
     evaluate,
+    plan,
     report,
     scale,
     train_encoder,
@@ -28,7 +28,7 @@ from hjepa_cli.stages import (
 )
 from hjepa_cli.stages.evaluate import check_horizon
 from hjepa_cli.stages.inputs import check_stride
-from hjepa_cli.stages.subject import how_to_train
+from hjepa_cli.stages.model_set import how_to_train
 from hjepa_cli.storage.checkpoints import MODEL_FILE
 from hjepa_cli.storage.runs import Run
 

@@ -8,12 +8,14 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli import __version__, plan, torchrun
-from hjepa_cli.checks import check_settings
+from hjepa_cli import __version__
+from hjepa_cli.compute import torchrun
+from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.datasets.dataset import MANIFEST, load_dataset
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
-from hjepa_cli.storage.datasets import MANIFEST, load_dataset
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages import plan
 from hjepa_cli.storage.runs import (
     CONFIG,
     RESULT,
@@ -129,7 +131,7 @@ def planned(directory: Path) -> plan.Plan:
             settings, checkpoint, dataset, directory, remeasure=remeasure, figure=figure
         )
     elif stage == "scale":
-        from hjepa_cli.core.capacity import parse_snr
+        from hjepa_cli.core.radio.capacity import parse_snr
 
         grid_db = parse_snr(settings.radio.snr_db)
         whole = plan.plan_scale(

@@ -11,16 +11,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import RAW_FRAMES, late
-from hjepa_cli.core.capacity import late_slots, parse_snr, slot_capacity
-from hjepa_cli.core.cell import Cell, Need, Row, best_flat, best_reflex, gain
-from hjepa_cli.core.methods import FRAME_BITS
-from hjepa_cli.core.plant import plant
+from hjepa_cli.config.checks import RAW_FRAMES, late
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.control.methods import FRAME_BITS
+from hjepa_cli.core.evaluation.cell import Cell, Need, Row, best_flat, best_reflex, gain
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.radio.capacity import late_slots, parse_snr, slot_capacity
 from hjepa_cli.errors import NumericalError
-from hjepa_cli.screen import Screen, described_steps, percent, span
-from hjepa_cli.settings import Settings
+from hjepa_cli.output.screen import Screen, described_steps, percent, span
 from hjepa_cli.stages.evaluate import curves_for, measure_points, open_measurable
-from hjepa_cli.stages.subject import Subject
+from hjepa_cli.stages.model_set import Subject
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
 
@@ -231,7 +231,7 @@ def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str] = CSV_COLU
 def draw(result: Mapping[str, Any], directory: Path, screen: Screen) -> list[Path]:
     """Write ``devices.png`` and ``devices.svg``; without matplotlib say how to get them."""
     try:
-        from hjepa_cli import figures
+        from hjepa_cli.output import figures
     except ModuleNotFoundError as missing:
         if not (missing.name or "").startswith("matplotlib"):
             raise

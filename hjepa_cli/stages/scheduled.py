@@ -9,18 +9,18 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.checks import LINKLESS, check_schedulable, check_warmup
-from hjepa_cli.core.capacity import parse_snr
-from hjepa_cli.core.cell import Row, best_flat, ratio_of
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.scheduled import BLOCK_DEVICES
-from hjepa_cli.core.workers import open_workers
+from hjepa_cli.config.checks import LINKLESS, check_schedulable, check_warmup
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.evaluation.cell import Row, best_flat, ratio_of
+from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES
+from hjepa_cli.core.evaluation.workers import open_workers
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.errors import MissingInputError
-from hjepa_cli.screen import Screen, span
-from hjepa_cli.settings import Settings
+from hjepa_cli.output.screen import Screen, span
+from hjepa_cli.stages.model_set import Subject, open_subject
 from hjepa_cli.stages.scale import PAPER_GAIN_PERCENT, PAPER_SNR_DB, draw, enforce, write_csv
 from hjepa_cli.stages.scheduled_cell import ScheduledCell
-from hjepa_cli.stages.subject import Subject, open_subject
 from hjepa_cli.storage.runs import Run
 
 COLUMNS = (

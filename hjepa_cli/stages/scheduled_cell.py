@@ -6,11 +6,8 @@ from collections.abc import Generator, Sequence
 from concurrent.futures import Future
 from typing import Any
 
-from hjepa_cli.core.cell import Row
-from hjepa_cli.core.coding import packet_uses
-from hjepa_cli.core.conditions import actual_plant
-from hjepa_cli.core.load_simulator import LoadSimulator, OneLoad, PacketBits, Search
-from hjepa_cli.core.scheduled import (
+from hjepa_cli.core.evaluation.cell import Row
+from hjepa_cli.core.evaluation.load_search import (
     BLOCK_DEVICES,
     MAX_BISECTIONS,
     LoadPoint,
@@ -18,11 +15,14 @@ from hjepa_cli.core.scheduled import (
     combine,
     pooled_score,
 )
-from hjepa_cli.core.simulator import Tick, silent
-from hjepa_cli.core.uplink import report_bits
-from hjepa_cli.core.workers import Workers
-from hjepa_cli.screen import Screen, ticking
-from hjepa_cli.stages.subject import Subject
+from hjepa_cli.core.evaluation.load_simulator import LoadSimulator, OneLoad, PacketBits, Search
+from hjepa_cli.core.evaluation.simulator import Tick, silent
+from hjepa_cli.core.evaluation.workers import Workers
+from hjepa_cli.core.plants.conditions import actual_plant
+from hjepa_cli.core.radio.coding import packet_uses
+from hjepa_cli.core.radio.uplink import report_bits
+from hjepa_cli.output.screen import Screen, ticking
+from hjepa_cli.stages.model_set import Subject
 
 VERIFY_AT = (0.9, 1.1)  # times the load
 Key = tuple[str, str, float]  # method, scheduler, SNR in dB

@@ -12,18 +12,19 @@ from typing import Any
 import torch
 from torch import nn
 
-from hjepa_cli.core import health
-from hjepa_cli.core.encoder import Encoder
-from hjepa_cli.core.jepa import Jepa
-from hjepa_cli.core.model import build_modules, tensors_of
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.predictors import Predictor
-from hjepa_cli.core.ranks import Ranks, joined
-from hjepa_cli.core.shared_norm import share_statistics
-from hjepa_cli.core.training import fit_actor, resolve_device
+from hjepa_cli.compute.device import resolve_device
+from hjepa_cli.config.settings import Settings, dotted
+from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.encoder import Encoder
+from hjepa_cli.core.networks.model import build_modules, tensors_of
+from hjepa_cli.core.networks.predictors import Predictor
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.training.jepa import Jepa
+from hjepa_cli.core.training.optimiser import fit_actor
+from hjepa_cli.core.training.ranks import Ranks, joined
+from hjepa_cli.core.training.shared_norm import share_statistics
 from hjepa_cli.errors import NumericalError, UsageError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings, dotted
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import baselines
 from hjepa_cli.stages.frame_training import Training, standardisation_sample
 from hjepa_cli.stages.inputs import (

@@ -18,25 +18,22 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hjepa_cli.core import health, levels
-from hjepa_cli.core.control_errors import control_errors
-from hjepa_cli.core.hierarchy import Strides
-from hjepa_cli.core.levels import EmbeddedTrajectories
-from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.metrics import window_means
-from hjepa_cli.core.model import LEVELS, Model, build_modules, load_modules, tensors_of
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.seeding import generator
-from hjepa_cli.core.training import (
-    Optimiser,
-    autocast,
-    fit_actor,
-    name_samples,
-    resolve_device,
-)
+from hjepa_cli.compute.device import autocast, resolve_device
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.control.force_error import window_means
+from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.datasets.dataset import Dataset
+from hjepa_cli.core.evaluation.control_errors import control_errors
+from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.hierarchy import Strides
+from hjepa_cli.core.networks.model import LEVELS, Model, build_modules, load_modules, tensors_of
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.training import levels
+from hjepa_cli.core.training.levels import EmbeddedTrajectories
+from hjepa_cli.core.training.optimiser import Optimiser, fit_actor, name_samples
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.inputs import (
     RenderedSplit,
     check_stride,
@@ -49,7 +46,6 @@ from hjepa_cli.stages.inputs import (
 )
 from hjepa_cli.stages.progress import Progress
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
-from hjepa_cli.storage.datasets import Dataset
 from hjepa_cli.storage.runs import Run, describe_input, newest_run, read_config
 from hjepa_cli.storage.zoo import find_model, resolve_model
 

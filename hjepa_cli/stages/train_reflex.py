@@ -15,22 +15,26 @@ import torch
 from numpy.random import Generator
 from torch import Tensor, nn
 
-from hjepa_cli.core import decay_fit, health, reflex_training
-from hjepa_cli.core.codecs import build_codec
-from hjepa_cli.core.control_errors import control_errors
-from hjepa_cli.core.decay_fit import Law, Trial
-from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.metrics import window_means
-from hjepa_cli.core.model import Model, build_modules, load_modules, tensors_of
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.reflex import Reflex
-from hjepa_cli.core.seeding import generator
-from hjepa_cli.core.sensors import embedding_sensor
-from hjepa_cli.core.system import Floats, System
-from hjepa_cli.core.training import Optimiser, autocast, fit_actor, name_samples, resolve_device
+from hjepa_cli.compute.device import autocast, resolve_device
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.codecs import build_codec
+from hjepa_cli.core.control.force_error import window_means
+from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.control.sensors import embedding_sensor
+from hjepa_cli.core.datasets.dataset import Dataset
+from hjepa_cli.core.evaluation.control_errors import control_errors
+from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.model import Model, build_modules, load_modules, tensors_of
+from hjepa_cli.core.networks.reflex import Reflex
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.system import System
+from hjepa_cli.core.training import decay_fit, reflex_training
+from hjepa_cli.core.training.decay_fit import Law, Trial
+from hjepa_cli.core.training.optimiser import Optimiser, fit_actor, name_samples
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
+from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.inputs import (
     RenderedSplit,
     embed,
@@ -39,11 +43,10 @@ from hjepa_cli.stages.inputs import (
     training_run,
     versions,
 )
+from hjepa_cli.stages.model_set import default_model
 from hjepa_cli.stages.progress import Progress
-from hjepa_cli.stages.subject import default_model
 from hjepa_cli.stages.train_hierarchy import embed_all, views_of
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
-from hjepa_cli.storage.datasets import Dataset
 from hjepa_cli.storage.runs import Run, describe_input
 from hjepa_cli.storage.zoo import resolve_model
 

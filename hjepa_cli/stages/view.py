@@ -5,69 +5,35 @@ pole, the pole that a linear probe reads from the controller's current embedding
 SNR and the age of the last packet. It shows a handful of devices; numbers come from ``eval``.
 """
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from hjepa_cli.checks import ANCHORS, RAW_FRAMES
-from hjepa_cli.core import health
-from hjepa_cli.core.capacity import equal_devices
-from hjepa_cli.core.channel import rayleigh_power_gains
-from hjepa_cli.core.codecs import bits_of
-from hjepa_cli.core.conditions import actual_camera, actual_plant
-from hjepa_cli.core.controllers import StrideController
-from hjepa_cli.core.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
-from hjepa_cli.core.methods import build_method
-from hjepa_cli.core.model import Model
-from hjepa_cli.core.plant import plant
-from hjepa_cli.core.seeding import generator
-from hjepa_cli.core.system import System
-from hjepa_cli.core.trajectories import generate
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.checks import ANCHORS, RAW_FRAMES
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.control.codecs import bits_of
+from hjepa_cli.core.control.controllers import StrideController
+from hjepa_cli.core.control.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
+from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.datasets.trajectories import generate
+from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.system import System
+from hjepa_cli.core.radio.capacity import equal_devices
+from hjepa_cli.core.radio.channel import rayleigh_power_gains
 from hjepa_cli.errors import MissingInputError, UsageError
-from hjepa_cli.screen import Screen
-from hjepa_cli.settings import Settings
-from hjepa_cli.stages.subject import Subject, open_subject
+from hjepa_cli.output.film import Film, Link
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.model_set import Subject, open_subject
 from hjepa_cli.storage import files
 
 FADING_KEY = 0xFAD1
 PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encoded in seconds
-
-
-@dataclasses.dataclass(frozen=True)
-class Link:
-    """What the radio does to n devices over K steps.
-
-    Attributes:
-        delivered: which packets arrive [K, n].
-        snr_db: received SNR in each slot [K, n].
-        sends_always: a packet in every slot, so that one that does not arrive was lost.
-        label: one line for people.
-    """
-
-    delivered: Bools
-    snr_db: Floats
-    sends_always: bool
-    label: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Film:
-    """What happened to the devices of one method.
-
-    Attributes:
-        method: its name.
-        states: true states [K, n, S].
-        believed: states read from the controller's embedding [K, n, S].
-        score: whether each step was inside the band [K, n].
-    """
-
-    method: str
-    states: Floats
-    believed: Floats
-    score: Bools
 
 
 class Believer:
@@ -75,7 +41,7 @@ class Believer:
 
     Args:
         controller: drives n devices from embeddings.
-        probe: of :func:`hjepa_cli.core.health.fit_probe`.
+        probe: of :func:`hjepa_cli.core.networks.health.fit_probe`.
     """
 
     def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
@@ -139,8 +105,8 @@ def run(
         MissingInputError: no model, or a library is missing.
     """
     try:
-        from hjepa_cli import animation
-        from hjepa_cli import live as terminal
+        from hjepa_cli.output import animation
+        from hjepa_cli.output import live as terminal
     except ModuleNotFoundError as missing:
         if missing.name != "PIL":
             raise

@@ -21,10 +21,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
-from hjepa_cli import __version__, torchrun
+from hjepa_cli import __version__
+from hjepa_cli.compute import torchrun
+from hjepa_cli.compute.interrupts import exit_code
+from hjepa_cli.config.settings import Settings, dotted, load_settings
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
-from hjepa_cli.interrupts import exit_code
-from hjepa_cli.settings import Settings, dotted, load_settings
 from hjepa_cli.storage import files, tracking
 
 ROOT = Path("runs")
@@ -71,7 +72,7 @@ class Run:
         Args:
             stage: the command's name.
             out: a new or empty directory, an interrupted run to take up, or a finished one.
-            settings: resolved settings (:meth:`hjepa_cli.settings.Settings.as_dict`).
+            settings: resolved settings (:meth:`hjepa_cli.config.settings.Settings.as_dict`).
             inputs: what else the stage was given, for ``hjepa resume``: files by
                 :func:`describe_input`, flags as they are.
             root: the parent of the automatic directories.
@@ -370,7 +371,7 @@ def load_recorded(preset: str | None, directory: Path) -> Settings:
     """Load the settings of a run; before there was a warm-up, loops were scored from the start.
 
     Raises:
-        As :func:`~hjepa_cli.settings.load_settings`.
+        As :func:`~hjepa_cli.config.settings.load_settings`.
     """
     protocol = read_config(directory).get("protocol", {})
     scored_all = isinstance(protocol, Mapping) and "warmup_steps" not in protocol

@@ -1,0 +1,122 @@
+"""How far two levels disagree about where a device is: an uncertainty that costs no packet.
+
+The hierarchy reaches the same step by different strides: P^H in one of h steps, the predictor of
+stride 1 in h of one. Played with the same forces from the same packet they drift apart as their
+models err, and the drift d = |C(z̃) − C(ẑ)| ÷ 40 N is known without a look at the device. What the
+growth table says of a device's age is scaled by it:
+
+    f(A, d) = f(A) (d / d̄(A))^(2β),
+
+with d̄(A) the geometric mean over devices and β the slope of ln |error| over ln d at equal ages.
+β = 0 is the growth table itself.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.control.controllers import StrideController
+from hjepa_cli.core.control.error_growth import Growth, conformal_growth
+from hjepa_cli.core.control.force_error import control_error
+
+SMALLEST = 1e-5  # of the force range: levels that agree better have nothing to tell
+
+
+class TwoLevels:
+    """A stride controller with a second level beside it that plays no force.
+
+    Args:
+        controller: plays; its strides are those of P^H.
+        step: the level of stride 1: embeddings [n, D] and forces_n [n, *A] → embeddings [n, D].
+        act: embeddings [n, D] → forces_n [n, *A].
+        force_limit_n: of the actuator.
+    """
+
+    def __init__(
+        self,
+        controller: StrideController,
+        step: Callable[[Tensor, Tensor], Tensor],
+        act: Callable[[Tensor], Tensor],
+        force_limit_n: float,
+    ) -> None:
+        self._controller, self._step, self._act = controller, step, act
+        self._limit_n = force_limit_n
+        self._beside = torch.zeros(0, 0)
+        self._apart = np.zeros(0)
+
+    @torch.inference_mode()
+    def act(self, delivered: Bools, packets: Any) -> Floats:
+        """As the controller's."""
+        forces_n = self._controller.act(delivered, packets)
+        if packets is not None:
+            if not len(self._beside):
+                self._beside = packets.new_zeros(len(delivered), packets.shape[1])
+                self._apart = np.zeros(len(delivered))
+            self._beside[torch.from_numpy(delivered)] = packets
+            self._apart[delivered] = 0.0
+        self._beside = self._step(self._beside, torch.from_numpy(forces_n).float())
+        over, reached = self._controller.reached
+        if over.any():
+            rows = torch.from_numpy(np.flatnonzero(over))
+            forces = [self._act(z[rows]).float().cpu().numpy() for z in (reached, self._beside)]
+            apart = control_error(forces[0], forces[1], self._limit_n)
+            self._apart[over] = apart.reshape(len(rows), -1).mean(axis=1)
+        return forces_n
+
+    def outlook(self) -> Floats:
+        """As the controller's."""
+        return self._controller.outlook()
+
+    @property
+    def apart(self) -> Floats:
+        """d: how far the levels were apart when each device's last stride ended [n]."""
+        return self._apart
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Levels:
+    """What disagreement adds to a growth table.
+
+    Attributes:
+        growth: f(A).
+        typical: d̄(1) … d̄(A_max).
+        exponent: β, 0 to 1.
+    """
+
+    growth: Growth
+    typical: Floats
+    exponent: float
+
+    def doubt(self, age: ArrayLike, apart: Floats) -> Floats:
+        """f(A, d) ÷ f(A) of devices at ages A ≥ 1 whose levels are d apart."""
+        place = np.minimum(np.asarray(age, np.int64), len(self.typical)) - 1
+        relative = np.maximum(apart, SMALLEST) / self.typical[place]
+        return np.asarray(relative ** (2.0 * self.exponent))
+
+
+def calibrate_levels(ages: Sequence[int], errors: Floats, apart: Floats) -> Levels:
+    """Fit d̄ and β on half of the devices, and the growth table of what is left on the other half.
+
+    So the split-conformal promise holds for f(A, d): a new device of the same kind stays below
+    √f(A, d) with the table's probability.
+
+    Args:
+        ages: ascending ages ≥ 1 [G].
+        errors: absolute errors [n, G] of n devices without a packet since age 0.
+        apart: d of the same devices at the same ages [n, G].
+    """
+    half = len(errors) // 2
+    d = np.log(np.maximum(apart, SMALLEST))
+    error = np.log(np.maximum(errors, SMALLEST))
+    centre = d[:half].mean(axis=0)
+    spread, met = d[:half] - centre, error[:half] - error[:half].mean(axis=0)
+    exponent = float(np.clip((spread * met).sum() / max((spread**2).sum(), 1e-12), 0.0, 1.0))
+    typical = np.exp(np.interp(np.arange(1, ages[-1] + 1), ages, centre))
+    scaled = errors[half:] / np.exp(exponent * (d[half:] - centre))
+    return Levels(conformal_growth(ages, scaled), typical, exponent)

@@ -1,0 +1,367 @@
+"""The closed loop: plants, the link's schedule and a controller, batched over devices and points.
+
+One step k of every loop, in this order:
+
+1. a device that transmits at k senses its state (its last frames, or the true state) and the
+   controller receives the packet, without delay unless it takes longer than a slot;
+2. the controller picks the force u_k, from packets alone;
+3. step k is scored on the state x_k and the force u_k, once the warm-up is over;
+4. the plant moves to x_{k+1} under u_k and process noise.
+
+Devices N and curve points P (different link schedules on the same draws) share one simulation.
+"""
+
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.settings import ProtocolSettings
+from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.plants.cost import COST_CAP
+from hjepa_cli.core.plants.frames import LONGEST, frames_seen
+from hjepa_cli.core.plants.system import System
+from hjepa_cli.errors import NumericalError, UsageError
+
+LOOP_VERSION = 5  # raise it whenever a measured number changes: cached curves then expire
+STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
+_DRAWS_KEY = 0xD4A5
+GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples, modulo 1, spread evenly however many are taken
+
+
+class Controller(Protocol):
+    """The remote side. It has no way to the plant: packets come in, forces go out."""
+
+    def act(self, delivered: Bools, packets: Any) -> Floats:
+        """Forces of one step.
+
+        Args:
+            delivered: which devices' packets arrive at this step [n].
+            packets: what they carry [delivered.sum(), ...]; ``None`` when there are none.
+
+        Returns:
+            Forces in newton [n, *A].
+        """
+        ...
+
+
+Sensor = Callable[[Floats], Any]
+"""The device side: the last states of m devices [m, 4, S], the present one last → packets [m, ...].
+
+Those before a device was switched on are copies of its first; see
+:func:`~hjepa_cli.core.plants.frames.frames_seen`.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Draws:
+    """Everything random in the closed loop, common to all methods and curve points.
+
+    Device i's draws come from its own generator: they do not depend on how many devices there
+    are, so the first 64 of 256 devices are the 64 devices.
+
+    Attributes:
+        initial: states at k = -1 [N, S].
+        noise: added to the states after each step [steps, N, S].
+        delivery: uniform numbers; a packet gets through where they are below p [steps, N].
+        mass_scale: two masses of each device (a cart's and its pole's) ÷ nominal [N, 2].
+        warmup_steps: how many of the steps, the first ones, are not scored.
+    """
+
+    initial: Floats
+    noise: Floats
+    delivery: Floats
+    mass_scale: Floats
+    warmup_steps: int = 0
+
+    @classmethod
+    def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
+        """Draw for ``devices`` devices, all derived from ``seed``."""
+        states = len(protocol.half_widths)
+        initial = np.empty((devices, states))
+        noise = np.empty((protocol.total_steps, devices, states))
+        delivery = np.empty((protocol.total_steps, devices))
+        mass_scale = np.empty((devices, 2))
+        for device in range(devices):
+            start, scale, uniforms, random = device_draws(protocol, seed, device)
+            initial[device], mass_scale[device], delivery[:, device] = start, scale, uniforms
+            noise[:, device] = random.standard_normal((protocol.total_steps, states))
+        noise *= noise_per_step(protocol)
+        return cls(initial, noise, delivery, mass_scale, protocol.warmup_steps)
+
+    @property
+    def devices(self) -> int:
+        return len(self.initial)
+
+    @property
+    def steps(self) -> int:
+        return len(self.noise)
+
+    def part(self, devices: slice) -> "Draws":
+        """The draws of some of the devices."""
+        return Draws(
+            self.initial[devices],
+            self.noise[:, devices],
+            self.delivery[:, devices],
+            self.mass_scale[devices],
+            self.warmup_steps,
+        )
+
+
+def device_draws(
+    protocol: ProtocolSettings, seed: int, device: int
+) -> tuple[Floats, Floats, Floats, np.random.Generator]:
+    """Draw a device's initial state [S], mass factors [2] and delivery uniforms [total steps].
+
+    The stream, returned last, goes on with the standard normal noise of one step after the other.
+    """
+    half_widths = np.array(protocol.half_widths)
+    random = generator(seed, _DRAWS_KEY, device)
+    initial = random.uniform(-1, 1, half_widths.size) * half_widths
+    mass_scale = 1 + protocol.plant_spread * random.uniform(-1, 1, 2)
+    return initial, mass_scale, random.random(protocol.total_steps), random
+
+
+def noise_per_step(protocol: ProtocolSettings) -> Floats:
+    """Standard deviation of the process noise of one step in each state [S].
+
+    ``velocity`` disturbs velocities, as forces would; ``isotropic`` has one standard deviation,
+    that of the first velocity, in all states (the paper's n_s, whose size it leaves open).
+    """
+    noise = np.array(protocol.velocity_noise)
+    return np.full_like(noise, noise[1]) if protocol.process_noise == "isotropic" else noise
+
+
+def every_step(steps: int, devices: int) -> Bools:
+    """The schedule of a perfect link: bool [steps, devices], all true."""
+    return np.ones((steps, devices), dtype=bool)
+
+
+def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
+    """One packet every D steps: device i sends at 0, and at ⌈nD + φ_i⌉ for n = 0, 1, …
+
+    The packet at 0 is one more than the period asks for: :func:`packets_per_step` counts it. The
+    phases φ_i = D · (i · golden ratio mod 1) spread any number of devices evenly over a period.
+
+    Args:
+        gap_steps: D ≥ 1, whole or fractional, finite.
+
+    Returns:
+        bool [steps, devices].
+
+    Raises:
+        UsageError: D < 1, or infinite.
+    """
+    if not 1 <= gap_steps < math.inf:
+        raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer, and finite")
+    phases = gap_steps * np.fmod(np.arange(devices) * GOLDEN, 1.0)
+    periods = np.arange(int(steps / gap_steps) + 1)
+    # 1e-9 keeps a sum that is whole up to rounding from being sent one step late.
+    times = np.ceil(periods[:, None] * gap_steps + phases - 1e-9).astype(np.int64)
+    schedule = np.zeros((steps, devices), dtype=bool)
+    period, device = np.nonzero(times < steps)
+    schedule[times[period, device], device] = True
+    schedule[0] = True
+    return schedule
+
+
+def packets_per_step(gap_steps: npt.ArrayLike, scored_steps: int, warmup_steps: int) -> Floats:
+    """Return how many packets a loop under :func:`gap_schedule` sends per scored step.
+
+    It is 1/D in steady state, and 1/D + (1 − 1/D)/K where the K scored steps begin with the loop,
+    since everybody is heard once at step 0 whatever its phase.
+
+    Args:
+        gap_steps: D ≥ 1.
+        scored_steps: K.
+        warmup_steps: unscored steps before them.
+    """
+    periodic = 1.0 / np.asarray(gap_steps, np.float64)
+    return periodic if warmup_steps else periodic + (1.0 - periodic) / scored_steps
+
+
+def delivery_schedule(probability: float, delivery: Floats) -> Bools:
+    """Every step is sent and gets through with probability p; the first packet always does.
+
+    Args:
+        probability: p in 0 … 1.
+        delivery: uniform numbers [steps, devices].
+
+    Returns:
+        bool [steps, devices].
+
+    Raises:
+        UsageError: p outside 0 … 1.
+    """
+    if not 0 <= probability <= 1:
+        raise UsageError(f"delivery probability {probability}; it lies between 0 and 1")
+    schedule = delivery < probability
+    schedule[0] = True
+    return schedule
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a simulation measured, averaged over its scored steps.
+
+    Attributes:
+        score: share of steps inside the band [P, N].
+        cost: mean capped quadratic cost [P, N].
+        lost: 1 where the loop is :attr:`World.lost` after the last step, else 0 [P, N].
+    """
+
+    score: Floats
+    cost: Floats
+    lost: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence["Outcome"], axis: int) -> "Outcome":
+        """Join outcomes along points (axis 0) or devices (axis 1)."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(*(np.concatenate([getattr(one, name) for one in parts], axis) for name in names))
+
+    def part(self, points: slice, devices: slice = slice(None)) -> "Outcome":
+        """Take some of the points and devices."""
+        return Outcome(*(getattr(self, f.name)[points, devices] for f in dataclasses.fields(self)))
+
+
+def simulate(
+    plant: System,
+    draws: Draws,
+    delivered: Bools,
+    controller: Controller,
+    sensor: Sensor,
+    *,
+    delay_steps: int = 0,
+    tick: Callable[[], None] = lambda: None,
+    watch: Callable[[int, Floats, Floats], None] = lambda k, states, forces_n: None,
+) -> Outcome:
+    """Run P × N closed loops at once.
+
+    Args:
+        plant: what is controlled; device masses are scaled by ``draws.mass_scale``.
+        draws: initial states, noise and deliveries of N devices.
+        delivered: link schedules [P, steps, N]; see :func:`gap_schedule`.
+        controller: drives P · N devices, point by point; in its initial state.
+        sensor: turns states into packets.
+        delay_steps: how long a packet is under way.
+        tick: called after every step, for progress.
+        watch: called at every step with k, states [P · N, S] and applied forces [P · N, *A].
+
+    Raises:
+        NumericalError: the controller returned a force that is not finite.
+    """
+    points, steps, devices = delivered.shape
+    assert (steps, devices) == draws.delivery.shape, (delivered.shape, draws.delivery.shape)
+    initial, mass_scale = (
+        np.tile(drawn, (points, 1)) for drawn in (draws.initial, draws.mass_scale)
+    )
+    noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
+    world = World(plant, initial, mass_scale, noise, draws.warmup_steps)
+    nothing = np.zeros(points * devices, dtype=bool), None
+    under_way = deque([nothing] * min(delay_steps, steps))
+    for k in range(steps):
+        states, sent = world.states, delivered[:, k].reshape(-1)
+        under_way.append((sent, world.sense(sensor, sent)))
+        watch(k, states, world.move(controller.act(*under_way.popleft())))
+        tick()
+    means = world.means(steps - draws.warmup_steps)
+    return Outcome(*(values.reshape(points, devices) for values in means))
+
+
+class World:
+    """Plants that go on step by step, each step scored.
+
+    Args:
+        plant: of all devices.
+        initial: states at k = -1 [N, S]; the camera needs the frame before k = 0.
+        mass_scale: of each device [N, 2].
+        noise: added to the states [N, S] after one step after the other.
+        warmup_steps: how many steps go by before scores and costs are summed.
+
+    Attributes:
+        states: now [N, S].
+        score, cost: sums over the scored steps so far [N].
+    """
+
+    def __init__(
+        self,
+        plant: System,
+        initial: Floats,
+        mass_scale: Floats,
+        noise: Iterator[Floats],
+        warmup_steps: int = 0,
+    ) -> None:
+        devices = len(initial)
+        self._plant, self._noise = plant, noise
+        self._plants = plant.simulation(devices, mass_scale=mass_scale)
+        self._plants.states = initial
+        switched_on = [self._plants.states] * (LONGEST - 1)
+        self._plants.step(plant.no_force(devices))
+        self.states = self._plants.states
+        self._seen = deque([*switched_on, self.states], maxlen=LONGEST)
+        self.score, self.cost = np.zeros(devices), np.zeros(devices)
+        self._step, self._warmup_steps = 0, warmup_steps
+
+    @property
+    def lost(self) -> Bools:
+        """Whether each loop's state, as it is now, costs as much as a step can [N].
+
+        The stage cost is capped (:data:`~hjepa_cli.core.statistics.COST_CAP`) where control has lost
+        the device: a cart-pole of plant desktop whose pole leans by more than 1.58 rad, or whose
+        cart is further than 1.58 m away.
+        """
+        at_rest = self._plant.no_force(len(self.states))
+        return np.asarray(self._plant.cost(self.states, at_rest) >= COST_CAP)
+
+    def means(self, scored_steps: int) -> tuple[Floats, Floats, Floats]:
+        """Return score and cost per scored step, and who is lost as 0 or 1 [N] each."""
+        return self.score / scored_steps, self.cost / scored_steps, self.lost.astype(np.float64)
+
+    def sense(self, sensor: Sensor, devices: Bools) -> Any:
+        """Packets of some devices; ``None`` where there are none."""
+        if not devices.any():
+            return None
+        return sensor(np.stack([states[devices] for states in self._seen], axis=1))
+
+    def move(self, forces_n: Floats) -> Floats:
+        """Score this step and go on to the next; returns the forces as applied [N, *A].
+
+        Raises:
+            NumericalError: a force is not finite.
+        """
+        if not np.isfinite(forces_n).all():
+            raise NumericalError(f"the controller's force is not finite at step {self._step}")
+        forces_n = np.clip(forces_n, -self._plant.force_limit_n, self._plant.force_limit_n)
+        if self._step >= self._warmup_steps:
+            self.score += self._plant.in_band(self.states)
+            self.cost += self._plant.cost(self.states, forces_n)
+        self._plants.step(forces_n)
+        moved = self._plants.states + next(self._noise)
+        self._plants.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
+        self.states = self._plants.states
+        self._seen.append(self.states)
+        self._step += 1
+        return forces_n
+
+
+def last_states(rollouts: Floats, k: int) -> Floats:
+    """What a sensor gets in step k of rollouts [R, steps + 1, S], whose index 0 is before k = 0."""
+    return rollouts[:, frames_seen(k, LONGEST)]
+
+
+def play(
+    controller: Controller, packets: Any, devices: int, steps: int, *, delay_steps: int = 0
+) -> Floats:
+    """What a controller plays after a single packet, sent at k = 0: forces [devices, steps, *A]."""
+    arrives = np.ones(devices, dtype=bool)
+    forces = [
+        controller.act(*((arrives, packets) if k == delay_steps else (~arrives, None)))
+        for k in range(steps)
+    ]
+    return np.stack(forces, axis=1)

@@ -1,0 +1,1 @@
+"""Recorded trajectories: made by simulation, kept on disk, handed on in other formats."""

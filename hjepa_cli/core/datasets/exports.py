@@ -1,0 +1,122 @@
+"""Datasets for other programs: HDF5 in stable-worldmodel's layout, and NPZ with the same columns.
+
+One row per frame, trajectory after trajectory. A trajectory of T steps gives T + 1 rows: its first
+is the frame before k = 0, which moves on without force. So no frame is lost, and row j of a
+trajectory holds what was seen and the action that led from there to row j + 1:
+
+- ``pixels`` uint8 [rows, 64, 128, 3], the camera's RGB frames;
+- ``state`` float32 [rows, S], of a cart-pole x (m), x_dot (m/s), theta (rad), theta_dot (rad/s);
+- ``action`` float32 [rows, m], the m applied forces (a cart-pole's one) ÷ the limit, in [-1, 1];
+- ``teacher_action`` float32 [rows, m], what the teacher would do there, on the same scale;
+- ``ep_len`` int32 and ``ep_offset`` int64 [trajectories], rows of each and its first row.
+"""
+
+import io
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hjepa_cli.core.datasets.dataset import Trajectories
+from hjepa_cli.errors import MissingInputError
+from hjepa_cli.storage.files import write_bytes
+
+TOGETHER = 20  # trajectories rendered and written at a time
+
+Frames = Callable[[Trajectories], np.ndarray]
+"""Trajectories → their frames uint8 [N, T + 1, H, W, 3]."""
+
+
+def columns(
+    split: Trajectories, first_teacher_n: np.ndarray, force_limit_n: float
+) -> dict[str, np.ndarray]:
+    """All columns but ``pixels``.
+
+    Args:
+        split: N trajectories.
+        first_teacher_n: the teacher's forces [N, *A] before k = 0, which are not stored.
+        force_limit_n: what actions are divided by.
+    """
+    count, rows = split.states.shape[:2]
+    applied_n = np.concatenate([np.zeros_like(first_teacher_n)[:, None], split.applied_n], axis=1)
+    teacher_n = np.concatenate([first_teacher_n[:, None], split.teacher_n], axis=1)
+    return {
+        "state": split.states.reshape(count * rows, -1),
+        "action": (applied_n / force_limit_n).astype(np.float32).reshape(count * rows, -1),
+        "teacher_action": (teacher_n / force_limit_n).astype(np.float32).reshape(count * rows, -1),
+        "ep_len": np.full(count, rows, np.int32),
+        "ep_offset": np.arange(count, dtype=np.int64) * rows,
+    }
+
+
+def write_hdf5(
+    path: Path,
+    values: dict[str, np.ndarray],
+    pixels: Iterator[np.ndarray] | None,
+    frame_shape: tuple[int, ...],
+    about: dict[str, Any],
+) -> Path:
+    """Write the columns as one HDF5 file, atomically; equal data give equal bytes.
+
+    Args:
+        path: the file to replace.
+        values: of :func:`columns`.
+        pixels: blocks of frames [n, H, W, 3] in row order; ``None`` leaves the column out.
+        frame_shape: (H, W, 3).
+        about: plain JSON data, kept as the attribute ``hjepa``.
+
+    Raises:
+        MissingInputError: h5py is not installed.
+        StorageError: the disk refused.
+    """
+    try:
+        import h5py
+    except ModuleNotFoundError:
+        raise MissingInputError(
+            "HDF5 needs h5py, which is not installed",
+            hint='pip install "hjepa[hdf5]", or --format npz',
+        ) from None
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w", libver="latest") as file:
+        for name, array in values.items():
+            file.create_dataset(name, data=array)
+        if pixels is not None:
+            shape = (len(values["state"]), *frame_shape)
+            # A frame per chunk, as peers read single rows; gzip makes it 50 times smaller.
+            column = file.create_dataset(
+                "pixels", shape, np.uint8, chunks=(1, *frame_shape), compression=1
+            )
+            start = 0
+            for block in pixels:
+                column[start : start + len(block)] = block
+                start += len(block)
+        file.attrs["hjepa"] = json.dumps(about, sort_keys=True)
+    write_bytes(path, buffer.getvalue())
+    return path
+
+
+def write_npz(
+    path: Path,
+    values: dict[str, np.ndarray],
+    pixels: Iterator[np.ndarray] | None,
+    about: dict[str, Any],
+) -> Path:
+    """Write the columns as one compressed NPZ file, atomically; equal data give equal bytes."""
+    arrays = dict(values)
+    if pixels is not None:
+        arrays["pixels"] = np.concatenate(list(pixels))
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, hjepa=np.array(json.dumps(about, sort_keys=True)), **arrays)
+    write_bytes(path, buffer.getvalue())
+    return path
+
+
+def blocks(split: Trajectories, frames: Frames, tick: Callable[[int], None]) -> Iterator[Any]:
+    """Frames of a split in row order, some trajectories at a time: [n, H, W, 3]."""
+    for start in range(0, len(split), TOGETHER):
+        part = split[start : start + TOGETHER]
+        images = frames(part)
+        yield images.reshape(-1, *images.shape[-3:])
+        tick(len(part))

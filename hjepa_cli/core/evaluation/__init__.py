@@ -1,0 +1,1 @@
+"""What is measured of closed loops, and what follows for a cell."""

@@ -1,0 +1,328 @@
+"""The measuring protocol: curves over the gap and over the delivery probability, and tolerances.
+
+A curve is measured on a grid with few devices; where it crosses the acceptable score it is
+measured again with more, until the crossing is bracketed to a few per cent.
+Both curves live on one axis, the mean gap g between packets in steps: D = g for the gap curve,
+p = 1/g for the delivery curve, whose crossing is interpolated in ln p instead of in D.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hjepa_cli.config.settings import ProtocolSettings
+from hjepa_cli.core import statistics
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.loop import Draws, Outcome, delivery_schedule, gap_schedule
+
+BESIDE = ("in_band", "lq_ratio", "lost")  # what a point of a curve has beside its score
+KINDS = ("gap", "delivery")
+STEP_OUT = 4  # brackets that a search goes outwards at a time, until the interval is inside
+MAX_GUESSES = 4  # rounds of a search that go by guessing, before it bisects
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """One point of a curve: a link with mean gap ``gap`` between packets, in steps.
+
+    Attributes:
+        kind: ``"gap"``: every D = ``gap`` steps; ``"delivery"``: with p = 1/``gap`` at each.
+    """
+
+    kind: str
+    gap: float
+
+    def schedule(self, draws: Draws) -> NDArray[np.bool_]:
+        """When packets arrive: bool [steps, N]."""
+        if self.kind == "gap":
+            return gap_schedule(self.gap, draws.steps, draws.devices)
+        return delivery_schedule(1 / self.gap, draws.delivery)
+
+    def coordinate(self) -> dict[str, float]:
+        """``{"d": D}`` or ``{"p": p}``, as curves are printed."""
+        return {"d": self.gap} if self.kind == "gap" else {"p": 1 / self.gap}
+
+
+Measure = Callable[[Sequence[Point], int], Outcome]
+"""Simulates points with the first ``devices`` draws: outcome arrays [P, devices]."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reference:
+    """The teacher, acting on the true state at every step, on the same draws.
+
+    Attributes:
+        score, cost: [N], all bracket devices.
+        seed: of the bootstrap.
+    """
+
+    score: Floats
+    cost: Floats
+    replicates: int
+    seed: int
+
+    def weights(self, devices: int) -> Floats:
+        """Bootstrap weights [B, devices], the same whenever asked."""
+        return statistics.bootstrap_weights(devices, self.replicates, self.seed)
+
+    def relative_score(self, outcome: Outcome) -> Floats:
+        """Normalised score of each point [P]."""
+        return statistics.ratio(outcome.score, self.score[: outcome.score.shape[1]])
+
+    def score_replicates(self, outcome: Outcome) -> Floats:
+        """Bootstrap replicates of the normalised score [B, P]."""
+        devices = outcome.score.shape[1]
+        return statistics.ratio(outcome.score, self.score[:devices], self.weights(devices))
+
+    def relative_cost(self, outcome: Outcome) -> Floats:
+        """LQ ratio of each point [P]: J of the teacher ÷ J of the method."""
+        return np.asarray(self.cost[: outcome.cost.shape[1]].mean() / outcome.cost.mean(axis=1))
+
+    def describe(self, points: Sequence[Point], outcome: Outcome) -> list[dict[str, Any]]:
+        """Return curve entries as printed.
+
+        Each has its coordinate, the normalised score and its interval, the share of steps in the
+        band as it is, the LQ ratio, the share of loops that were lost, and the number of devices.
+        """
+        scores = self.relative_score(outcome)
+        low, high = statistics.interval(self.score_replicates(outcome))
+        costs = self.relative_cost(outcome)
+        return [
+            {
+                **point.coordinate(),
+                "score": float(scores[i]),
+                "ci95": [float(low[i]), float(high[i])],
+                "in_band": float(outcome.score[i].mean()),
+                "lq_ratio": float(costs[i]),
+                "lost": float(outcome.lost[i].mean()),
+                "n_devices": outcome.score.shape[1],
+            }
+            for i, point in enumerate(points)
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """How sparse packets may get before the score falls below the acceptable one.
+
+    Attributes:
+        gap: mean gap in steps; 0 where not even a packet at every step suffices, the end of the
+            grid where the score is still acceptable there (``censored``).
+        interval: its 95 % interval, within the same two ends.
+    """
+
+    gap: float
+    interval: tuple[float, float]
+    censored: bool
+
+
+class Search:
+    """Finds the crossing of one curve: asks for points, takes their outcomes, until content.
+
+    The grid's values from few devices guide the search. Whatever decides the result is measured
+    with many: both ends of the final bracket, and points outside the interval. Where few devices
+    are many already, the grid has these, and the interval's ends lie on lines between its points.
+
+    Args:
+        kind: see :class:`Point`.
+        grid: ascending mean gaps.
+        grid_scores: normalised scores of the grid with few devices.
+        reference: the teacher with many devices.
+        protocol: acceptable score and bracket width.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        grid: Sequence[float],
+        grid_scores: Floats,
+        reference: Reference,
+        protocol: ProtocolSettings,
+    ) -> None:
+        self.kind = kind
+        self._grid = dict(zip(map(float, grid), grid_scores.tolist(), strict=True))
+        self._measured: dict[float, Outcome] = {}
+        self._reference = reference
+        self._level, self._bracket = protocol.acceptable_score, protocol.bracket
+        self._step_out = 1 + STEP_OUT * protocol.bracket
+        self._rounds = 0
+        self._steps_down = self._steps_up = 1
+
+    @property
+    def points(self) -> list[Point]:
+        """The points measured so far, ascending."""
+        return [Point(self.kind, gap) for gap in sorted(self._measured)]
+
+    @property
+    def outcome(self) -> Outcome:
+        """Their outcomes [P, N]."""
+        return Outcome.joined([self._measured[gap] for gap in sorted(self._measured)], axis=0)
+
+    def add(self, point: Point, outcome: Outcome) -> None:
+        """Take the outcome of a point with many devices [1, N]."""
+        self._measured[point.gap] = outcome
+
+    def wanted(self) -> list[Point]:
+        """The next points to measure with many devices; none when the search is over."""
+        self._rounds += 1
+        return [Point(self.kind, gap) for gap in self._next() if gap not in self._measured]
+
+    def result(self) -> Tolerance:
+        """The crossing and its interval from the points with many devices."""
+        crossing = float(self._cross(self._reference.relative_score(self.outcome)))
+        low, high = self._interval()
+        return Tolerance(
+            self._bounded(crossing), (self._bounded(low), self._bounded(high)), crossing == math.inf
+        )
+
+    def _next(self) -> Sequence[float]:
+        scores = self._best_known()
+        gaps = sorted(scores)
+        left, right = _bracket(gaps, [scores[gap] for gap in gaps], self._level)
+        if left is not None and right is not None and right / left - 1 > self._bracket:
+            return self._between(left, right, scores)
+        ends = [end for end in (left, right) if end is not None and end not in self._measured]
+        return ends or self._next_for_interval()
+
+    def _next_for_interval(self) -> Sequence[float]:
+        """Widen the measured range until the interval lies inside it, in steps that double."""
+        first, last = min(self._measured), max(self._measured)
+        low, high = self._interval()
+        wider = []
+        if low == -math.inf:
+            self._steps_down *= 2
+            wider.append(max(first / self._step_out ** (self._steps_down / 2), min(self._grid)))
+        if high == math.inf:
+            self._steps_up *= 2
+            wider.append(min(last * self._step_out ** (self._steps_up / 2), max(self._grid)))
+        return wider
+
+    def _best_known(self) -> dict[float, float]:
+        """Scores by gap: with many devices where measured, else the grid's."""
+        if not self._measured:
+            return dict(self._grid)
+        scores = self._reference.relative_score(self.outcome)
+        return self._grid | dict(zip(sorted(self._measured), scores.tolist(), strict=True))
+
+    def _interval(self) -> tuple[float, float]:
+        replicates = self._cross(self._reference.score_replicates(self.outcome))
+        low, high = statistics.interval(replicates)
+        return float(low), float(high)
+
+    def _cross(self, scores: Floats) -> Floats:
+        gaps = np.array(sorted(self._measured))
+        return statistics.first_crossing(gaps, scores, self._level, log=self._log)
+
+    def _between(self, left: float, right: float, scores: Mapping[float, float]) -> Sequence[float]:
+        """Where to cut a bracket that is too wide.
+
+        First at the guessed crossing and as far to both sides as intervals usually reach; then
+        with two cuts, a bracket's width apart, around a better guess. In the middle where the
+        bracket is short, and when guessing has not helped.
+        """
+        width = 1 + self._bracket
+        if self._rounds > MAX_GUESSES or right / left <= width**2:
+            return [self._middle(left, right)]
+        guess = self._guess(left, right, scores)
+        if not self._measured:
+            ends = min(self._grid), max(self._grid)
+            fan = (guess / self._step_out, guess, guess * self._step_out)
+            return sorted({min(max(gap, ends[0]), ends[1]) for gap in fan})
+        guess = min(max(guess, left * width), right / width)
+        half = math.sqrt(width) * (1 - 1e-9)
+        return [gap for gap in (guess / half, guess * half) if left < gap < right]
+
+    def _guess(self, left: float, right: float, scores: Mapping[float, float]) -> float:
+        """The crossing on a line: between the ends, unless just one of them is measured.
+
+        Then the line goes through that one, with the grid's slope: few devices tell how steep a
+        curve is better than how high.
+        """
+        known = [gap for gap in (left, right) if gap in self._measured]
+        to, back = (math.log, math.exp) if self._log else (float, float)
+        through, drop = left, scores[left] - scores[right]
+        if len(known) == 1:
+            through, drop = known[0], self._on_grid(left) - self._on_grid(right)
+        if drop <= 0:
+            return self._middle(left, right)
+        steps = (scores[through] - self._level) / drop
+        return back(min(to(through) + steps * (to(right) - to(left)), to(max(self._grid))))
+
+    def _on_grid(self, gap: float) -> float:
+        """The score that few devices have at any gap, interpolated."""
+        return float(np.interp(gap, list(self._grid), list(self._grid.values())))
+
+    def _middle(self, left: float, right: float) -> float:
+        return math.sqrt(left * right) if self._log else (left + right) / 2
+
+    def _bounded(self, gap: float) -> float:
+        """Below at the first point: 0; never below: the end of the grid."""
+        return {-math.inf: 0.0, math.inf: max(self._grid)}.get(gap, gap)
+
+    @property
+    def _log(self) -> bool:
+        return self.kind == "delivery"
+
+
+def _bracket(
+    gaps: Sequence[float], scores: Sequence[float], level: float
+) -> tuple[float | None, float | None]:
+    """The neighbouring gaps around the first fall below ``level``; ``None`` beyond the grid."""
+    for index, score in enumerate(scores):
+        if score < level:
+            return (gaps[index - 1] if index else None), gaps[index]
+    return gaps[-1], None
+
+
+@dataclasses.dataclass(frozen=True)
+class Curves:
+    """One method under one protocol.
+
+    Attributes:
+        grid: outcomes on the grid by kind, few devices.
+        searches: finished searches by kind, many devices.
+    """
+
+    grid: dict[str, tuple[list[Point], Outcome]]
+    searches: dict[str, Search]
+
+
+def measure_curves(
+    measure: Measure,
+    every_step: Callable[[], Outcome],
+    reference: Reference,
+    protocol: ProtocolSettings,
+) -> Curves:
+    """Measure both curves of one method and search both tolerances, always in one batch.
+
+    Args:
+        measure: simulates points of the method.
+        every_step: waits for the method with a packet at every step (g = 1), [1, curve devices]:
+            the first point of both curves, the same for all methods with one sensor and one actor.
+        reference: the teacher with all bracket devices.
+        protocol: grid, devices, level and bracket.
+    """
+    gaps = [float(gap) for gap in protocol.gaps]
+    later = [Point(kind, gap) for kind in KINDS for gap in gaps[1:]]
+    outcome = measure(later, protocol.curve_devices) if later else None
+    first = every_step()
+    grid, searches = {}, {}
+    for number, kind in enumerate(KINDS):
+        rows = slice(number * (len(gaps) - 1), (number + 1) * (len(gaps) - 1))
+        parts = [first, *([outcome.part(rows)] if outcome else [])]
+        points, joined = [Point(kind, gap) for gap in gaps], Outcome.joined(parts, axis=0)
+        grid[kind] = (points, joined)
+        search = Search(kind, gaps, reference.relative_score(joined), reference, protocol)
+        if protocol.curve_devices == protocol.bracket_devices:  # few devices are many already
+            for row, point in enumerate(points):
+                search.add(point, joined.part(slice(row, row + 1)))
+        searches[kind] = search
+    while wanted := [point for search in searches.values() for point in search.wanted()]:
+        outcome = measure(wanted, protocol.bracket_devices)
+        for row, point in enumerate(wanted):
+            searches[point.kind].add(point, outcome.part(slice(row, row + 1)))
+    return Curves(grid, searches)

@@ -1,0 +1,316 @@
+"""The closed loop on all cores: worker processes, each computing units that were described to it.
+
+A control step is many small operations on few devices, which threads do not speed up; processes do.
+A unit is computed in one thread, whose sums have one order, wherever that is: so results are the
+same bytes from any number of workers.
+"""
+
+import dataclasses
+import functools
+import itertools
+import multiprocessing
+import threading
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from contextlib import contextmanager
+from multiprocessing.sharedctypes import Synchronized
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import torch
+
+from hjepa_cli.compute.executors import (
+    MAX_WORKERS,
+    broken_pool_reported,
+    cores,
+    open_cluster,
+    placement,
+    prepare_worker,
+    worker_pool,
+)
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.control.loop import Outcome
+from hjepa_cli.core.evaluation.simulator import Block, Runner, Simulator, Tick, silent
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.errors import DataError
+
+TICK_S = 0.2  # between looks at the workers' progress
+WORTH_WORKERS = 50_000  # device-steps of a unit; below, processes cost more than they bring
+SIMULATORS = 16  # that a worker keeps: one per model
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelFile:
+    """A checkpoint that workers load: where it is, and its digest when the command read it.
+
+    Attributes:
+        loaded: the model, in the process that has loaded it; it is not sent.
+    """
+
+    path: Path
+    digest: str
+    loaded: Model | None = dataclasses.field(default=None, compare=False, repr=False)
+
+    def __reduce__(self) -> tuple[type["ModelFile"], tuple[Path, str]]:
+        return ModelFile, (self.path, self.digest)
+
+    def load(self, device: str) -> Model:
+        """Raise DataError if the file has changed since."""
+        if self.loaded is not None:
+            return self.loaded
+        model = Model.load(self.path, device)
+        if model.digest != self.digest:
+            raise DataError(
+                f"{self.path} is another model here than the command was given",
+                hint="let the training that writes it end; workers must see the same files",
+            )
+        return model
+
+
+class Simulates(Protocol):
+    """What computes units of one kind; made where they are computed."""
+
+    def run(self, unit: Any, tick: Tick) -> Any:
+        """Compute a unit."""
+        ...
+
+
+Make = Callable[[Settings, Model | None], Simulates]
+"""Makes it: a class of a module, which other processes find by its name."""
+
+
+class Workers:
+    """Computes units wherever the executor does; several threads may ask for some.
+
+    Args:
+        executor: of worker processes or a cluster, whose workers see the models' files under the
+            same paths.
+        count: how many units are computed at once.
+        counter: how many device-steps the workers say they have done; ``None`` counts those of
+            finished units.
+    """
+
+    def __init__(
+        self, executor: Executor, count: int, counter: Callable[[], int] | None = None
+    ) -> None:
+        self.count = count
+        self._finished = self._told = 0
+        self._executor, self._counter = executor, counter or (lambda: self._finished)
+        self._lock, self._closed = threading.Lock(), False
+
+    def submit(
+        self,
+        make: Make,
+        settings: Settings,
+        model: ModelFile | None,
+        unit: Hashable,
+        tick: Tick = silent,
+    ) -> "Future[Any]":
+        """Start a unit; :meth:`results` waits for it.
+
+        Raises:
+            NumericalError: a worker has died before.
+        """
+        with self._lock, broken_pool_reported():
+            if self._closed:
+                raise CancelledError
+            future = self._executor.submit(compute, make, settings, model, unit)
+        future.add_done_callback(self._count)
+        return future
+
+    def results(self, futures: Sequence["Future[Any]"], tick: Tick = silent) -> list[Any]:
+        """Wait for units, and tell ``tick`` the device-steps that nobody has been told before.
+
+        Raises:
+            NumericalError: a worker died (out of memory, killed); errors inside a unit are raised
+                as they are.
+        """
+        waiting = set(futures)
+        while waiting:
+            waiting = wait(waiting, TICK_S).not_done
+            with self._lock:
+                if self._closed:
+                    raise CancelledError
+                now = self._counter()
+                tick(now - self._told)
+                self._told = now
+        with broken_pool_reported():
+            return [future.result()[0] for future in futures]
+
+    def runner(self, settings: Settings, model: ModelFile | None) -> Runner:
+        """A runner of blocks over the workers."""
+
+        def start(blocks: Sequence[Block], tick: Tick) -> Callable[[], list[Outcome]]:
+            futures = [self.submit(Simulator, settings, model, block, tick) for block in blocks]
+            return lambda: self.results(futures, tick)
+
+        return start
+
+    def each(self, drive: Callable[[J], R], jobs: Iterable[J]) -> Iterator[tuple[J, R]]:
+        """Drive as many jobs at a time as there are workers, each in a thread of its own.
+
+        A job is a search that asks for units step by step: while one waits, the units of another
+        are computed.
+
+        Returns:
+            The jobs and their results, as they are ready. The first error ends it; of what is
+            ready by then nothing is lost.
+        """
+        left, flying = iter(jobs), dict[Future[R], J]()
+        while True:
+            for job in itertools.islice(left, max(self.count - len(flying), 0)):
+                flying[_in_thread(drive, job)] = job
+            if not flying:
+                return
+            done, _ = wait(flying, return_when=FIRST_COMPLETED)
+            ready = [future for future in flying if future in done]
+            for future in sorted(ready, key=lambda future: future.exception() is not None):
+                yield flying.pop(future), future.result()
+
+    def close(self) -> None:
+        """Let no thread start anything more, nor show progress."""
+        with self._lock:
+            self._closed = True
+
+    def _count(self, future: "Future[Any]") -> None:
+        if not future.cancelled() and future.exception() is None:
+            self._finished += future.result()[1]
+
+
+class ThisProcess(Workers):
+    """No workers: units are computed as they are submitted, as a worker would."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._made: dict[Hashable, Simulates] = {}
+
+    def submit(
+        self,
+        make: Make,
+        settings: Settings,
+        model: ModelFile | None,
+        unit: Hashable,
+        tick: Tick = silent,
+    ) -> "Future[Any]":
+        """Compute a unit; errors inside it are raised as they are."""
+        future, key = Future[Any](), (make, settings, model)
+        with one_thread():
+            if key not in self._made:
+                self._made[key] = make(settings, _loaded(settings, model))
+            future.set_result(self._made[key].run(unit, tick))
+        return future
+
+    def results(self, futures: Sequence["Future[Any]"], tick: Tick = silent) -> list[Any]:
+        """The results of units; the ticks were told while they were computed."""
+        return [future.result() for future in futures]
+
+    def each(self, drive: Callable[[J], R], jobs: Iterable[J]) -> Iterator[tuple[J, R]]:
+        """Drive the jobs one after the other."""
+        return ((job, drive(job)) for job in jobs)
+
+
+@contextmanager
+def open_workers(unit_steps: int) -> Iterator[Workers]:
+    """The workers of the :func:`~hjepa_cli.compute.executors.placement`.
+
+    Args:
+        unit_steps: device-steps of a usual unit: where the user did not say, there is a process
+            per core if that is worth it, and otherwise this one alone.
+
+    Raises:
+        UsageError: no scheduler answers.
+    """
+    where, count = placement(), min(cores(), MAX_WORKERS)
+    if where.workers is not None:
+        count = where.workers
+    elif where.cluster is None and (count == 1 or unit_steps < WORTH_WORKERS):
+        count = 0
+    if where.cluster is not None:
+        with open_cluster(where.cluster, count or cores()) as (executor, threads):
+            yield from _closing(Workers(executor, threads))
+    elif count:
+        done: Synchronized[int] = multiprocessing.get_context("spawn").Value("q", 0)
+        counter = done.get_obj()
+        with worker_pool(count, _start, done) as pool:
+            # Read without the lock: a worker that is killed holding it would never give it back.
+            yield from _closing(Workers(pool, count, lambda: counter.value))
+    else:
+        yield ThisProcess()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute as workers do, whose sums have one order."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _closing(workers: Workers) -> Iterator[Workers]:
+    try:
+        yield workers
+    finally:
+        workers.close()
+
+
+def _in_thread(drive: Callable[[J], R], job: J) -> "Future[R]":
+    """A thread that does not keep the program from ending."""
+    future: Future[R] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(drive(job))
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future
+
+
+# What a worker process keeps between units.
+_done: "Synchronized[int] | None" = None
+_one_at_a_time = threading.Lock()  # a Dask worker may have threads; a simulator is for one
+
+
+def _start(done: "Synchronized[int]") -> None:
+    global _done
+    prepare_worker()
+    _done = done
+
+
+def compute(
+    make: Make, settings: Settings, model: ModelFile | None, unit: Hashable
+) -> tuple[Any, int]:
+    """Compute one unit in a worker, in one thread; the model is loaded with its first.
+
+    Returns:
+        What it is, and how many device-steps it took.
+    """
+    steps = 0
+
+    def tick(count: int) -> None:
+        nonlocal steps
+        steps += count
+        if _done is not None:
+            with _done.get_lock():
+                _done.value += count
+
+    with _one_at_a_time:
+        torch.set_num_threads(1)
+        return _made(make, settings, model).run(unit, tick), steps
+
+
+@functools.lru_cache(maxsize=SIMULATORS)
+def _made(make: Make, settings: Settings, model: ModelFile | None) -> Simulates:
+    # The workers of a cluster outlive commands: the digest tells a model from one trained since.
+    return make(settings, _loaded(settings, model))
+
+
+def _loaded(settings: Settings, model: ModelFile | None) -> Model | None:
+    return model.load(settings.device) if model else None

@@ -1,0 +1,1 @@
+"""What is controlled: plants, their teachers and cameras, and what they do over time."""

@@ -1,0 +1,94 @@
+"""The cart-poles as plants: ``desktop``, the paper's at 1 ms, and ``gym``, Gymnasium's at 20 ms."""
+
+import dataclasses
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.plants.cartpole.camera import Camera
+from hjepa_cli.core.plants.cartpole.dynamics import rk4_step
+from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
+from hjepa_cli.core.plants.cartpole.teacher import sdre
+from hjepa_cli.core.plants.cost import stage_cost
+from hjepa_cli.core.plants.frames import WIDTH_PX
+from hjepa_cli.core.plants.system import System, Teacher
+
+if TYPE_CHECKING:
+    from hjepa_cli.core.plants.cartpole.simulation import CartPoles
+
+SCORE_X_M = 0.05
+SCORE_THETA_RAD = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class CartPolePlant(CartPoleParameters, System):
+    """A kind of cart-pole with all that surrounds it."""
+
+    state_names: ClassVar[tuple[str, ...]] = ("x", "x_dot", "theta", "theta_dot")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "rad", "rad/s")
+
+    def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> "CartPoles":
+        """See :class:`hjepa_cli.core.plants.cartpole.simulation.CartPoles`."""
+        from hjepa_cli.core.plants.cartpole.simulation import CartPoles  # pymunk, when it is needed
+
+        return CartPoles(self, devices, mass_scale=mass_scale)
+
+    def in_band(self, states: Floats) -> Bools:
+        """|x| ≤ 0.05 m and |θ| ≤ 0.05 rad. States [..., 4] → bool [...]."""
+        return (np.abs(states[..., 0]) <= SCORE_X_M) & (np.abs(states[..., 2]) <= SCORE_THETA_RAD)
+
+    def cost(self, states: Floats, forces_n: Floats) -> Floats:
+        """See :func:`hjepa_cli.core.plants.cost.stage_cost`, with the teacher's weights."""
+        return stage_cost(states, forces_n, self.state_weights, self.force_weight)
+
+    def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
+        """The track looks the same everywhere: only x moves."""
+        moved = np.array(states, float)
+        moved[..., 0] += np.asarray(shift_px) * self.window_m[0] / WIDTH_PX
+        return moved
+
+    def advance(self, states: Floats, forces_n: Floats) -> Floats:
+        """See :func:`hjepa_cli.core.plants.cartpole.dynamics.rk4_step`."""
+        return rk4_step(self, states, forces_n, self.step_s)
+
+    def teacher(self) -> Teacher:
+        """See :func:`hjepa_cli.core.plants.cartpole.teacher.sdre`."""
+        return sdre(self)
+
+    def camera(self) -> Camera:
+        """See :class:`hjepa_cli.core.plants.cartpole.camera.Camera`."""
+        return Camera(self)
+
+    def with_pole_length(self, scale: float) -> "CartPolePlant":
+        """The same with a pole ``scale`` times as long."""
+        return dataclasses.replace(self, half_length_m=scale * self.half_length_m)
+
+
+DESKTOP = CartPolePlant(
+    name="desktop",
+    cart_mass_kg=0.25,
+    pole_mass_kg=0.05,
+    half_length_m=0.1,
+    step_s=1e-3,
+    state_weights=(20.0, 0.5, 20.0, 0.05),
+    force_weight=0.05,
+    discrete_teacher=False,
+    window_m=(0.6, 0.3),
+    cart_size_m=(0.06, 0.03),
+    pole_width_m=0.016,
+)
+GYM = CartPolePlant(
+    name="gym",
+    cart_mass_kg=1.0,
+    pole_mass_kg=0.1,
+    half_length_m=0.5,
+    step_s=20e-3,
+    state_weights=(1.0, 0.1, 10.0, 0.1),
+    force_weight=0.01,
+    discrete_teacher=True,
+    window_m=(3.2, 1.6),
+    cart_size_m=(0.32, 0.16),
+    pole_width_m=0.085,
+)

@@ -1,0 +1,149 @@
+"""Plants by their names, as users give them."""
+
+import hashlib
+import inspect
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hjepa_cli import plugins
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.settings import Settings
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.plants.cartpole import camera
+from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
+from hjepa_cli.core.plants.cartpole.simulation import CartPoles
+from hjepa_cli.core.plants.system import System, Teacher
+from hjepa_cli.errors import UsageError
+
+VERSIONED = ("desktop", "gym")
+START = np.array([0.03, 0.1, 0.08, 0.5])  # m, m/s, rad, rad/s: where a seeded CartPole starts
+
+
+def plant(name: str) -> System:
+    """Return the plant called ``name``.
+
+    Raises:
+        UsageError: there is none, naming the valid choices.
+    """
+    found: System = plugins.PLANTS[name]
+    return found
+
+
+def plant_of(settings: Settings) -> System:
+    """Return the plant of the settings, after checking that they have one value per state.
+
+    Raises:
+        UsageError: they do not.
+    """
+    kind = plant(settings.plant)
+    for name, values in (
+        ("collect.start", settings.collect.half_widths),
+        ("encoder.gate_r2", settings.encoder.least_r2),
+        ("protocol.start", settings.protocol.half_widths),
+        ("protocol.noise", settings.protocol.velocity_noise),
+    ):
+        if len(values) != len(kind.state_names):
+            raise UsageError(
+                f"{name} has {len(values)} values; plant {kind.name} has {len(kind.state_names)} "
+                f"states: {', '.join(kind.state_names)}",
+                hint=f"--plant {kind.name}, or a --config FILE.toml that sets {name}",
+            )
+    return kind
+
+
+def definition(name: str) -> str | None:
+    """What measurements on a plant depend on: the digest of the file that defines it.
+
+    ``None`` for the plants of the zoo: :data:`hjepa_cli.core.control.loop.LOOP_VERSION` tells
+    theirs apart.
+    """
+    if name in VERSIONED:
+        return None
+    if source := plugins.PLANTS.source(name):
+        return source.sha256
+    file = inspect.getsourcefile(type(plant(name)))
+    assert file is not None
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+def cart_pole(which: CartPolePlant | str) -> CartPolePlant:
+    """Return a plant, given as such or by name, that is a cart-pole.
+
+    Raises:
+        UsageError: it is not.
+    """
+    kind = plant(which) if isinstance(which, str) else which
+    if not isinstance(kind, CartPolePlant):
+        choices = [name for name in plugins.PLANTS if isinstance(plant(name), CartPolePlant)]
+        raise UsageError(f"plant '{kind.name}' is no cart-pole; choose one of {', '.join(choices)}")
+    return kind
+
+
+def teacher(preset: System | str) -> Teacher:
+    """Return the teacher of a plant.
+
+    Args:
+        preset: a plant or its name.
+
+    Returns:
+        A function from states ``[..., S]`` to forces ``[..., *A]`` in N within ± ``force_limit_n``;
+        for a cart-pole from ``[..., 4]`` to ``[...]``
+        (:func:`hjepa_cli.core.plants.cartpole.teacher.sdre`).
+
+    Raises:
+        UsageError: unknown plant.
+    """
+    return (plant(preset) if isinstance(preset, str) else preset).teacher()
+
+
+class Camera(camera.Camera):
+    """A cart-pole's camera; see :class:`hjepa_cli.core.plants.cartpole.camera.Camera`.
+
+    Args:
+        plant: a plant or its name.
+
+    Raises:
+        UsageError: unknown plant, or no cart-pole.
+    """
+
+    def __init__(self, plant: CartPolePlant | str) -> None:
+        super().__init__(cart_pole(plant))
+
+
+class CartPole:
+    """One cart-pole.
+
+    Args:
+        preset: a plant or its name, ``"desktop"`` or ``"gym"``.
+        seed: draw the initial state from this seed, uniform within ± :data:`START`; ``None``
+            starts upright and at rest.
+    """
+
+    def __init__(self, preset: CartPolePlant | str, *, seed: int | None = None) -> None:
+        self._poles = CartPoles(cart_pole(preset), 1)
+        self.plant = self._poles.plant
+        if seed is not None:
+            self.state = generator(seed).uniform(-1, 1, 4) * START
+
+    @property
+    def state(self) -> Floats:
+        """The state ``[4]``: x [m], x_dot [m/s], theta [rad], theta_dot [rad/s]."""
+        return self._poles.states.reshape(4)
+
+    @state.setter
+    def state(self, state: ArrayLike) -> None:
+        self._poles.states = np.asarray(state, float).reshape(1, 4)
+
+    def step(self, force_n: float, *, noise: ArrayLike | None = None) -> Floats:
+        """Advance by one control step and return the new state ``[4]``.
+
+        Args:
+            force_n: force on the cart [N], clipped to ± ``plant.force_limit_n``.
+            noise: ``[4]`` added to the state after the step; ``None`` adds none.
+        """
+        self._poles.step(np.reshape(force_n, 1))
+        if noise is not None:
+            self.state = self.state + np.asarray(noise, float)
+        return self.state

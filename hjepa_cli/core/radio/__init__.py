@@ -1,0 +1,1 @@
+"""The radio cell: links, codes, schedulers and laws of sharing."""

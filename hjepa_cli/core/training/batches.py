@@ -1,0 +1,140 @@
+"""Training batches: whole sub-sampled trajectories, so that one encoding of a frame serves as
+start, target and inverse-dynamics sample at once."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hjepa_cli.core.plants.frames import frames_seen
+
+Labels = Callable[[Tensor, Tensor, NDArray[np.int64]], Tensor]
+"""Trajectories [B, 1], steps k [B, F], shifts [B, 1] in px → the teacher's actions ÷ force limit
+[B, F, *A] in the states that the shifted pictures show."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrajectoryBatch:
+    """B windows of F frames, ``stride`` control steps apart.
+
+    Attributes:
+        frames: uint8 [B · F, κ, H, W, 3], the current one last.
+        actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
+        drawn: which windows were drawn, for messages.
+        labels: what the teacher would do there ÷ force limit [B · F, *A], if the windows have any.
+    """
+
+    frames: Tensor
+    actions: Tensor
+    drawn: str = ""
+    labels: Tensor | None = None
+
+
+def window_indices(
+    length: int, frames: int, stride: int, generator: np.random.Generator, count: int
+) -> NDArray[np.int64]:
+    """Steps k of ``count`` random windows inside 0 … length − 1: int64 [count, frames]."""
+    last_start = length - 1 - (frames - 1) * stride
+    starts = generator.integers(0, last_start + 1, size=count)
+    return starts[:, None] + stride * np.arange(frames)[None, :]
+
+
+def stride_actions(actions: Tensor, steps: Tensor, stride: int) -> Tensor:
+    """Actions of every stride: [B, T, *A] and frame steps [B, F] → [B, F − 1, stride, *A].
+
+    Row f holds u_k … u_{k + stride − 1} for k = steps[f], the actions that lead from frame f to
+    frame f + 1.
+    """
+    offsets = steps[:, :-1, None] + torch.arange(stride)
+    batch = torch.arange(len(actions))[:, None, None]
+    return actions[batch, offsets]
+
+
+class FrameWindows:
+    """Draws :class:`TrajectoryBatch` es from rendered trajectories.
+
+    Args:
+        frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.
+        actions: applied actions ÷ force limit [N, T, *A].
+        window_frames, stride: F and the control steps between frames.
+        mirror: flip half of the windows left to right and their actions with them, which is exact
+            physics and doubles the data.
+        shift_px: move every window sideways by −shift_px … shift_px whole pixels, the same for all
+            its frames. Exact physics as well, as long as nothing leaves the picture: the same
+            motion elsewhere on the track.
+        mirrored_actions: what mirroring does to actions, a factor for each.
+        labels: what the teacher does in shifted pictures, where that is wanted.
+        frames_each: κ, of which a device remembers no more than it has seen.
+    """
+
+    def __init__(
+        self,
+        frames: Tensor,
+        actions: Tensor,
+        *,
+        window_frames: int,
+        stride: int,
+        mirror: bool,
+        shift_px: int = 0,
+        mirrored_actions: float | tuple[float, ...] = -1.0,
+        labels: Labels | None = None,
+        frames_each: int = 2,
+    ) -> None:
+        self.frames, self.actions = frames, actions
+        self.steps = actions.shape[1]
+        self.window_frames = min(window_frames, (self.steps - 1) // stride + 1)
+        self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
+        self.mirrored_actions = torch.tensor(mirrored_actions)
+        self.labels, self.frames_each = labels, frames_each
+
+    def draw(
+        self, count: int, generator: np.random.Generator, share: slice = slice(None)
+    ) -> TrajectoryBatch:
+        """``count`` windows from trajectories drawn without replacement where they suffice.
+
+        Of these the windows ``share`` are cut out: what is drawn does not depend on it.
+        """
+        total = len(self.frames)
+        chosen = generator.choice(total, size=count, replace=count > total)
+        steps = window_indices(self.steps, self.window_frames, self.stride, generator, count)
+        trajectories = torch.from_numpy(chosen[share])
+        k = torch.from_numpy(steps[share])
+        actions = stride_actions(self.actions[trajectories], k, self.stride)
+        rows = trajectories[:, None]
+        seen = torch.from_numpy(frames_seen(k.numpy(), self.frames_each))
+        frames = self.frames[rows[..., None], seen]
+        flipped = torch.zeros(len(k), dtype=torch.bool)
+        if self.mirror:
+            flipped = torch.from_numpy((generator.random(count) < 0.5)[share])
+            frames[flipped] = frames[flipped].flip(-2)
+            actions[flipped] *= self.mirrored_actions
+        shifts = np.zeros(len(k), dtype=np.int64)
+        if self.shift_px:
+            shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)[share]
+            for window, shift_px in zip(frames, shifts, strict=True):
+                window.copy_(shift_sideways(window, int(shift_px)))
+        labels = None
+        if self.labels is not None:  # a mirror image moved right is that of one moved left
+            before = np.where(flipped.numpy(), -shifts, shifts)
+            labels = self.labels(rows, k, before[:, None])
+            labels[flipped] *= self.mirrored_actions
+        windows = (f"{row} from k = {k[0]}" for row, k in zip(chosen, steps, strict=True))
+        return TrajectoryBatch(
+            frames.flatten(0, 1),
+            actions,
+            f"windows of trajectories {', '.join(windows)}",
+            None if labels is None else labels.flatten(0, 1),
+        )
+
+
+def shift_sideways(frames: Tensor, shift_px: int) -> Tensor:
+    """Frames [..., H, W, 3] moved right by ``shift_px`` (left: negative), edge columns repeated.
+
+    The scene is the same all along the track, so this is what the camera would have seen.
+    """
+    width = frames.shape[-2]
+    columns = torch.clamp(torch.arange(width) - shift_px, 0, width - 1)
+    return frames.index_select(-2, columns)

@@ -1,0 +1,251 @@
+"""How a decaying hold is fitted: by the gap that it tolerates, on devices that no evaluation draws.
+
+Gains and decay belong together. A law that is right with a packet at every step is too slow for
+sparse ones; a stiffer law whose force fades in time is a pulse that leaves a device at rest. So
+both are searched at once, on the true state, where many candidates cost little. What a trained
+actor makes of such a law is then corrected on embeddings, by a factor and the time alone.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.settings import ProtocolSettings
+from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.control.controllers import Oracle
+from hjepa_cli.core.control.loop import STATE_LIMIT, Draws, Sensor, gap_schedule, simulate
+from hjepa_cli.core.control.reflex_controllers import DecayingHold
+from hjepa_cli.core.control.sensors import true_state
+from hjepa_cli.core.plants.linear import gains_at_rest
+from hjepa_cli.core.plants.system import System
+from hjepa_cli.core.statistics import first_crossing, ratio
+
+SEARCH_SEED = 2_000_003  # added to the seed: searches see other devices than any evaluation
+SEARCH_KEY = 0xDECA
+AROUND = (0.5, 0.7, 0.85, 1.0, 1.15)  # of the oracle's tolerated gap: where candidates are tried
+ELITE = 6  # one candidate in so many shapes the next round
+TIE = 0.1  # weight of the mean score beside the tolerated gap ÷ the longest that is tried
+Evaluate = Callable[[Floats], Floats]
+"""Candidates [C, P] → how good each is [C]."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trial:
+    """Closed loops that candidates are compared in, all on the same draws.
+
+    Attributes:
+        kind: the nominal plant.
+        draws: of N devices.
+        gaps: between packets [G], in steps.
+        level: the acceptable score ÷ the teacher's.
+        teacher: the teacher's share of these steps in the band, with the true state at each step.
+    """
+
+    kind: System
+    draws: Draws
+    gaps: Floats
+    level: float
+    teacher: Floats
+
+    @classmethod
+    def make(
+        cls, kind: System, protocol: ProtocolSettings, *, devices: int, steps: int, seed: int
+    ) -> "Trial":
+        """Draw devices, and find the gaps to try them at: around what the oracle tolerates.
+
+        Args:
+            kind: the plant.
+            protocol: starts, noise, level and grid; its devices all are nominal here.
+            devices: N.
+            steps: that are scored, after the warm-up of the protocol.
+            seed: of the settings.
+        """
+        nominal = dataclasses.replace(protocol, steps=steps, plant_spread=0.0)
+        draws = Draws.make(nominal, devices, seed + SEARCH_SEED)
+        teacher = cls(kind, draws, np.ones(1), protocol.acceptable_score, np.ones(devices))
+        grid = np.array(protocol.gaps, float)
+        trial = dataclasses.replace(
+            teacher, gaps=grid, teacher=teacher.shares(_oracle(kind, devices), true_state)[0]
+        )
+        scores = ratio(trial.shares(_oracle(kind, devices * len(grid)), true_state), trial.teacher)
+        tolerated = float(first_crossing(grid, scores, trial.level, log=False))
+        tolerated = float(np.clip(tolerated, grid[min(1, len(grid) - 1)], grid[-1]))
+        gaps = np.clip(np.array(AROUND) * tolerated, 1.0, steps)
+        return dataclasses.replace(trial, gaps=gaps)
+
+    def first(self, devices: int) -> "Trial":
+        """The same with fewer devices, or as many as there are."""
+        part = slice(min(devices, self.draws.devices))
+        return dataclasses.replace(self, draws=self.draws.part(part), teacher=self.teacher[part])
+
+    @property
+    def schedules(self) -> Bools:
+        """When packets arrive [G, steps, N]."""
+        draws = self.draws
+        return np.stack([gap_schedule(gap, draws.steps, draws.devices) for gap in self.gaps])
+
+    def shares(self, controller: Any, sensor: Sensor, candidates: int = 1) -> Floats:
+        """Share of the scored steps in the band [C · G, N], candidate by candidate.
+
+        ``controller`` drives C · G · N devices.
+        """
+        schedules = np.tile(self.schedules, (candidates, 1, 1))
+        return simulate(self.kind, self.draws, schedules, controller, sensor).score
+
+    def quality(self, shares: Floats) -> Floats:
+        """How good candidates are [C], from :meth:`shares`.
+
+        The tolerated gap ÷ the longest that is tried, and a little of the mean score, which still
+        tells where no gap is tolerated or all are.
+        """
+        scores = ratio(shares, self.teacher).reshape(-1, len(self.gaps))
+        tolerated = first_crossing(self.gaps, scores, self.level, log=False)
+        tolerated = np.clip(tolerated, 0.0, self.gaps[-1])
+        return np.asarray(tolerated / self.gaps[-1] + TIE * scores.mean(axis=1))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Law:
+    """u = −K x at a packet, then e^(−j/τ) of it at age j.
+
+    Attributes:
+        gains_n: K [m, S], N per unit of state.
+        tau_steps: τ.
+    """
+
+    gains_n: Floats
+    tau_steps: float
+
+
+def cross_entropy(
+    evaluate: Evaluate, mean: Floats, spread: Floats, *, candidates: int, rounds: int, seed: int
+) -> Floats:
+    """Search by drawing candidates from a normal distribution and moving it to the best of them.
+
+    Args:
+        evaluate: what is maximised.
+        mean, spread: of the first round [P].
+        candidates: C of each round.
+        rounds: at least 1.
+        seed: of the draws.
+
+    Returns:
+        The mean [P] of the last round's best.
+    """
+    random = generator(seed, SEARCH_KEY)
+    for _ in range(rounds):
+        drawn = mean + spread * random.standard_normal((candidates, len(mean)))
+        drawn[0] = mean
+        best = np.argsort(-evaluate(drawn), kind="stable")[: max(candidates // ELITE, 2)]
+        mean, spread = drawn[best].mean(axis=0), drawn[best].std(axis=0) + 0.05 * spread
+    return mean
+
+
+def search_law(
+    trial: Trial, *, candidates: int, rounds: int, seed: int, tied: bool = False
+) -> tuple[Law, float]:
+    """Find K and τ together, on the true state.
+
+    K is sought as factors of the teacher's own gains at rest, each gain with a factor of its own
+    or, ``tied``, one for all.
+
+    Returns:
+        The law, and the factor (``tied``; 1 otherwise, where it is in the gains).
+    """
+    gains_n = gains_at_rest(trial.kind.teacher(), len(trial.kind.state_names))
+    factors = 1 if tied else gains_n.size
+
+    def law(candidate: Floats) -> tuple[Floats, Floats]:
+        shape = (len(candidate), 1, 1) if tied else (len(candidate), *gains_n.shape)
+        return gains_n * np.exp(candidate[:, :-1]).reshape(shape), np.exp(candidate[:, -1])
+
+    start = np.zeros(factors + 1)
+    start[-1] = 0.5 * np.log(trial.gaps[-1])
+    found = cross_entropy(
+        lambda candidate: trial.quality(shares_of_laws(trial, *law(candidate))),
+        start,
+        np.full(factors + 1, 0.7),
+        candidates=candidates,
+        rounds=rounds,
+        seed=seed,
+    )
+    gains, tau = law(found[None])
+    return Law(gains[0], float(tau[0])), float(np.exp(found[0])) if tied else 1.0
+
+
+def shares_of_laws(trial: Trial, gains_n: Floats, tau_steps: Floats) -> Floats:
+    """As :meth:`Trial.shares`, for laws K [C, m, S] and τ [C] on the true state.
+
+    By the plant's exact equations, many candidates at once.
+    """
+    kind, draws, schedules = trial.kind, trial.draws, trial.schedules
+    count, shape = len(gains_n), (len(gains_n), len(trial.gaps), draws.devices)
+    forces_n = np.zeros((*shape, gains_n.shape[1]))
+    action = (*shape, *kind.action_shape)
+    kept = np.exp(-1.0 / tau_steps).reshape(count, 1, 1, 1)
+    initial = np.broadcast_to(draws.initial, (*shape, draws.initial.shape[1]))
+    states = kind.advance(initial, forces_n.reshape(action))
+    inside = np.zeros(shape)
+    for k in range(draws.steps):
+        gap, device = np.nonzero(schedules[:, k])
+        if len(gap):
+            forces_n[:, gap, device] = -np.einsum("cms,cps->cpm", gains_n, states[:, gap, device])
+        if k >= draws.warmup_steps:
+            inside += kind.in_band(states)
+        applied_n = np.clip(forces_n, -kind.force_limit_n, kind.force_limit_n)
+        states = kind.advance(states, applied_n.reshape(action)) + draws.noise[k]
+        states = np.clip(states, -STATE_LIMIT, STATE_LIMIT)
+        forces_n *= kept
+    return inside.reshape(-1, draws.devices) / (draws.steps - draws.warmup_steps)
+
+
+def fit_decay(
+    trial: Trial,
+    actor: Callable[[Any], Any],
+    sensor: Sensor,
+    start: tuple[float, float],
+    *,
+    candidates: int,
+    rounds: int,
+    seed: int,
+) -> tuple[float, float]:
+    """Find s and τ for an actor on what a sensor really sends.
+
+    Args:
+        trial: the loops.
+        actor: packets → forces_n.
+        sensor: of the device.
+        start: s and τ to start from.
+        candidates, rounds, seed: of the search.
+
+    Returns:
+        s and τ in steps.
+    """
+    kind = trial.kind
+    loops = len(trial.gaps) * trial.draws.devices
+
+    def evaluate(candidate: Floats) -> Floats:
+        gains, taus = np.repeat(np.exp(candidate), loops, axis=0).T
+        controller = DecayingHold(
+            actor, gains, taus, kind.force_limit_n, len(gains), action_shape=kind.action_shape
+        )
+        return trial.quality(trial.shares(controller, sensor, len(candidate)))
+
+    found = cross_entropy(
+        evaluate,
+        np.log(np.array(start)),
+        np.full(2, 0.3),
+        candidates=candidates,
+        rounds=rounds,
+        seed=seed,
+    )
+    gain, tau_steps = np.exp(found)
+    return float(gain), float(tau_steps)
+
+
+def _oracle(kind: System, devices: int) -> Oracle:
+    states = len(kind.state_names)
+    return Oracle(kind.teacher(), kind.advance, kind.force_limit_n, devices, states=states)

@@ -1,0 +1,171 @@
+"""One training on several processes, which ``torchrun`` starts.
+
+Every process draws the same batch and takes its share of the windows. Gradients, losses and the
+statistics of batch norm are summed over all processes, so a step is that of one process with the
+whole batch, whatever their number; only the order of the sums differs.
+"""
+
+import dataclasses
+import datetime
+import importlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+from torch import distributed as dist
+
+from hjepa_cli.compute import torchrun
+from hjepa_cli.errors import HjepaError, UsageError
+
+# The others wait that long: for the first process while it examines the encoder, most of all.
+TIMEOUT = datetime.timedelta(minutes=30)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranks:
+    """The processes of a training, seen from one of them.
+
+    Attributes:
+        rank: number of this one.
+        size: how many there are.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """This one prints and writes."""
+        return self.rank == 0
+
+    def share(self, count: int) -> slice:
+        """Which of ``count`` items are this process's; the shares differ by one at most."""
+        return slice(count * self.rank // self.size, count * (self.rank + 1) // self.size)
+
+    def add_up(self, tensors: Sequence[Tensor]) -> None:
+        """Replace float tensors by their sums over all processes, in one message."""
+        if self.size == 1:
+            return
+        flat = torch.cat([tensor.detach().flatten() for tensor in tensors])
+        all_reduce(flat)
+        parts = torch.split(flat, [tensor.numel() for tensor in tensors])
+        with torch.no_grad():
+            for tensor, part in zip(tensors, parts, strict=True):
+                tensor.copy_(part.view(tensor.shape))
+
+    def gather(self, value: int) -> list[int]:
+        """The ``value`` of every process, by rank; all must ask."""
+        if self.size == 1:
+            return [value]
+        values = torch.zeros(self.size, dtype=torch.int64)
+        values[self.rank] = value
+        all_reduce(values)
+        found: list[int] = values.tolist()
+        return found
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """All processes pass this block, or none does.
+
+        Raises:
+            HjepaError: this process's own error, or that another one has failed.
+        """
+        try:
+            yield
+        except HjepaError as error:
+            codes = self.gather(error.exit_code)
+            if self.leads or codes[0]:
+                raise
+            alone = torchrun.OneOfSeveral(
+                f"process {self.rank} of {self.size}: {error.message}", hint=error.hint
+            )
+            alone.exit_code = error.exit_code
+            raise alone from None
+        codes = self.gather(0)
+        if failed := [rank for rank, code in enumerate(codes) if code]:
+            stopped = HjepaError(
+                f"process {failed[0]} of {self.size} cannot take part",
+                hint="its own message says why",
+            )
+            stopped.exit_code = codes[failed[0]]
+            raise stopped
+
+
+ALONE = Ranks()
+
+
+@contextmanager
+def joined(device: torch.device, items: int) -> Iterator[Ranks]:
+    """Meet the other processes of this ``torchrun``; alone without it.
+
+    Args:
+        device: what to compute on; on GPUs, each process of a machine takes its own.
+        items: the windows of a batch, to be shared.
+
+    Raises:
+        UsageError: more processes than windows, or than GPUs of this machine.
+    """
+    size = torchrun.size()
+    if size == 1:
+        yield ALONE
+        return
+    if size > items:
+        raise UsageError(
+            f"{size} processes cannot share a batch of {items} windows",
+            hint=f"torchrun with at most {items} processes, or a larger encoder.batch_trajectories",
+        )
+    if device.type == "cuda":
+        here, there = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
+        if here > there:
+            raise UsageError(
+                f"{here} processes on a machine with {there} GPUs",
+                hint=f"torchrun --nproc-per-node {there}, or --device cpu",
+            )
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    # The optimiser's first step imports this, and what it imports keeps the process group that it
+    # finds. The group's threads then outlive it, and some ends of the interpreter abort on them.
+    importlib.import_module("torch._dynamo")
+    # Counts and codes are exchanged on the CPU, whatever the device.
+    backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
+    dist.init_process_group(backend, timeout=TIMEOUT)
+    try:
+        yield Ranks(torchrun.rank(), size)
+    finally:
+        dist.destroy_process_group()
+
+
+def all_reduce(tensor: Tensor) -> None:
+    """Replace ``tensor`` by its sum over all processes.
+
+    Raises:
+        ContactLost: another process is gone.
+    """
+    try:
+        dist.all_reduce(tensor)
+    except RuntimeError:
+        raise torchrun.ContactLost(
+            f"process {torchrun.rank()} of {torchrun.size()} has lost the others: one was killed "
+            "or has failed",
+            hint="run the same command again; with --out it goes on where it was saved",
+        ) from None
+
+
+class Summed(torch.autograd.Function):
+    """The sum of a tensor over all processes, for losses that are summed over them too."""
+
+    @staticmethod
+    def forward(ctx: object, x: Tensor) -> Tensor:
+        total = x.clone()
+        all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: object, *gradients: Tensor) -> Tensor:
+        total = gradients[0].clone()
+        all_reduce(total)
+        return total
+
+
+summed: Callable[[Tensor], Tensor] = Summed.apply

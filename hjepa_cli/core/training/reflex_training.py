@@ -1,0 +1,112 @@
+"""What reflexes learn from: the teacher's plans, by the age of the packet that they start from."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.loop import STATE_LIMIT
+from hjepa_cli.core.networks.reflex import Reflex
+from hjepa_cli.core.plants.system import System
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plans:
+    """What follows a packet, step by step.
+
+    Attributes:
+        teacher: the teacher's forces ÷ force limit [N, L, *A] at the ages 0 … L − 1.
+        sent: the forces ÷ force limit that were applied [N, L, *A]; the teacher's where there is
+            no exploration.
+    """
+
+    teacher: Tensor
+    sent: Tensor
+
+
+def follow(
+    kind: System,
+    states: Floats,
+    steps: int,
+    *,
+    sides: Floats | None = None,
+    pushes_n: Floats | None = None,
+) -> Plans:
+    """Let the teacher drive on from some states, without noise.
+
+    Args:
+        kind: the plant.
+        states: of the packets [N, S].
+        steps: L.
+        sides: factors on the forces [N, F], where pictures show these states mirrored.
+        pushes_n: exploration added to the teacher's forces [N, L, *A]; none by default.
+    """
+    act, limit_n = kind.teacher(), kind.force_limit_n
+    teacher = np.empty((len(states), steps, *kind.action_shape), np.float32)
+    sent = teacher if pushes_n is None else np.empty_like(teacher)
+    side = 1.0 if sides is None else sides.reshape(len(states), *kind.action_shape)
+    for age in range(steps):
+        forces_n = np.clip(act(states), -limit_n, limit_n)
+        teacher[:, age] = side * forces_n / limit_n
+        if pushes_n is not None:
+            forces_n = np.clip(forces_n + pushes_n[:, age], -limit_n, limit_n)
+            sent[:, age] = side * forces_n / limit_n
+        # Clipped as in the loop: a lost pole must not overflow.
+        states = np.clip(kind.advance(states, forces_n), -STATE_LIMIT, STATE_LIMIT)
+    taught = torch.from_numpy(teacher)
+    return Plans(taught, taught if pushes_n is None else torch.from_numpy(sent))
+
+
+def pushes(
+    kind: System,
+    count: int,
+    steps: int,
+    *,
+    exploration_n: float,
+    hold_steps: int,
+    generator: np.random.Generator,
+) -> Floats:
+    """Exploration as ``collect`` makes it: forces [count, steps, *A], constant for a while each."""
+    held = -(-steps // hold_steps)
+    drawn_n = generator.normal(0.0, exploration_n, (count, held, *kind.action_shape))
+    return np.repeat(drawn_n, hold_steps, axis=1)[:, :steps]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drawn:
+    """A batch: rows of packets [B], and ages [B, J] at which the forces of each are asked for."""
+
+    packets: Tensor
+    ages: Tensor
+
+
+def draw(
+    network: Reflex, count: int, packets: int, ages: int, generator: np.random.Generator
+) -> Drawn:
+    """Random packets of ``count``, each at some random ages from 0 to the longest."""
+    rows = generator.integers(count, size=packets)
+    drawn = generator.integers(network.longest_age + 1, size=(packets, ages))
+    return Drawn(torch.from_numpy(rows), torch.from_numpy(drawn))
+
+
+def reflex_loss(network: Reflex, z: Tensor, plans: Plans, drawn: Drawn) -> Tensor:
+    """Mean squared error of the forces of a batch.
+
+    Args:
+        network: what learns.
+        z: embeddings of all packets [N, D].
+        plans: what follows them, A + H steps at least.
+        drawn: the batch.
+    """
+    rows, ages = drawn.packets, drawn.ages
+    ahead = ages[..., None] + torch.arange(network.shape[0])
+    labels = plans.teacher[rows[:, None, None], ahead]
+    sent = None
+    if network.sees_forces:
+        past = torch.arange(network.longest_age) < ages[..., None]
+        sent = plans.sent[rows, None, : network.longest_age]
+        sent = (sent * past.reshape(*past.shape, *[1] * (sent.dim() - 3))).to(z.device)
+    forces = network(z[rows.to(z.device)], ages.to(z.device), sent)
+    return nn.functional.mse_loss(forces.float(), labels.to(z.device))

@@ -1,0 +1,301 @@
+"""``hjepa data info | verify | preview | export``: what a dataset is, and whether it is intact."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hjepa_cli.core.datasets import exports
+from hjepa_cli.core.datasets.dataset import (
+    MANIFEST,
+    Dataset,
+    Trajectories,
+    find_newest_dataset,
+    load_dataset,
+)
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.plan import RATES_PER_S, Plan, size
+from hjepa_cli.storage import files
+
+Result = dict[str, Any]
+
+ROOT = Path("data")
+FORMATS = {"hdf5": (".h5", ".hdf5"), "npz": (".npz",)}  # the first suffix is written by default
+COMPRESSED_FRAME_BYTES = 700
+COMPRESSED_FRAMES_PER_S = 2_000.0
+
+
+def show_info(screen: Screen, path: Path | None) -> Result:
+    """Describe a dataset from its manifest.
+
+    Raises:
+        MissingInputError: no dataset there.
+        DataError: it is damaged.
+    """
+    data = opened(path, screen)
+    result = summary(data)
+    rows: list[list[object]] = [
+        ["plant", data.plant],
+        ["seed", data.settings.get("seed")],
+        ["frames", data.frames],
+        ["camera version", data.camera.get("version")],
+        ["on disk", size(result["size_bytes"])],
+        ["sha256", data.digest],
+    ]
+    for name, split in result["splits"].items():
+        trajectories = f"{split['trajectories']} trajectories of {split['steps']} steps"
+        rows.append([name, f"{trajectories} in {split['shards']} shards"])
+    collected = data.settings.get("collect", {})
+    rows += [[f"collect.{key}", value] for key, value in collected.items() if key != "plant"]
+    screen.table(f"Dataset {data.path}", ["", "value"], rows)
+    return {**result, "config": data.settings, "camera": data.camera}
+
+
+def verify(screen: Screen, paths: Sequence[Path]) -> Result:
+    """Read every shard and check sha256, shapes and values; all of data/ if none is named.
+
+    Raises:
+        MissingInputError: no dataset there.
+        DataError: at least one is damaged; the others are still checked and reported.
+    """
+    wanted = list(paths) or [
+        ROOT / name for name in files.list_names(ROOT) if (ROOT / name / MANIFEST).exists()
+    ]
+    if not wanted:
+        raise MissingInputError(f"no dataset in {ROOT}/", hint="hjepa collect")
+    damaged: list[HjepaError] = []
+    verified = []
+    for path in wanted:
+        try:
+            data = load_dataset(path)
+            ranges = {name: spread(data.split(name)) for name in data.splits}
+        except (DataError, MissingInputError) as error:
+            damaged.append(error)
+            continue
+        verified.append({**summary(data), "states": ranges})
+        screen.table(
+            f"{path}: intact, sha256 {data.digest}",
+            ["split", *labels(data.plant)],
+            [[name, *map(interval, values)] for name, values in ranges.items()],
+        )
+    for further in damaged[1:]:
+        screen.say(further.message)
+    if damaged:
+        raise damaged[0]
+    return {"verified": verified}
+
+
+def preview(
+    screen: Screen, path: Path | None, out: Path | None, split: str, rows: int, columns: int
+) -> Result:
+    """Draw a contact sheet: one trajectory per row, time from left to right.
+
+    Raises:
+        UsageError: no PNG file.
+        MissingInputError: no dataset, or no Pillow.
+        DataError: the dataset is damaged.
+    """
+    try:
+        from hjepa_cli.output import pictures
+    except ModuleNotFoundError as missing:
+        if missing.name != "PIL":
+            raise
+        raise MissingInputError(
+            "a preview needs Pillow, which is not installed", hint='pip install "hjepa[plot]"'
+        ) from None
+    if out is not None and out.suffix != ".png":
+        raise UsageError(f"a preview is a PNG file, not '{out.suffix}'; --out FILE.png")
+    data = opened(path, screen)
+    recorded = data.split(split)[:rows]
+    steps = np.linspace(0, recorded.steps - 1, min(columns, recorded.steps)).round().astype(int)
+    shown = recorded.states[:, steps + 1]
+    if recorded.frames is not None:
+        frames = recorded.frames[:, steps + 1]
+    else:
+        images = plant(data.plant).camera().render(shown.reshape(-1, shown.shape[-1]))
+        frames = images.reshape(*shown.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
+    captions = [
+        [f"{split} {row}, k {step}, {forces(recorded.applied_n[row, step])}" for step in steps]
+        for row in range(len(recorded))
+    ]
+    target = out or Path(f"{data.path.name}-{split}.png")
+    files.make_directory(target.parent)
+    pictures.save_png(pictures.contact_sheet(frames, captions), target)
+    screen.say(f"{len(recorded)} trajectories of {data.path}: {target}")
+    return {"dataset": str(data.path), "split": split, "picture": str(target)}
+
+
+def export(
+    screen: Screen,
+    path: Path | None,
+    out: Path | None,
+    split: str,
+    kind: str | None,
+    pixels: bool,
+) -> Result:
+    """Write one split for other programs; see :mod:`hjepa_cli.core.datasets.exports`.
+
+    Raises:
+        UsageError: no such format.
+        MissingInputError: no dataset, or no h5py.
+    """
+    kind = chosen_format(out, kind)
+    data = opened(path, screen)
+    recorded = data.split(split)
+    target = out or default_name(data, split, kind)
+    files.make_directory(target.parent)
+    system = plant(data.plant)
+    limit_n, camera = system.force_limit_n, system.camera()
+    values = exports.columns(recorded, system.teacher()(recorded.states[:, 0]), limit_n)
+    about = {
+        "dataset": data.digest,
+        "plant": data.plant,
+        "split": split,
+        "force_limit_n": limit_n,
+        "step_s": system.step_s,
+        "camera": data.camera,
+    }
+
+    def film(part: Trajectories) -> np.ndarray:
+        if part.frames is not None:
+            return part.frames
+        images = camera.render(part.states.reshape(-1, part.states.shape[-1]))
+        return images.reshape(*part.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
+
+    with screen.progress("export", len(recorded), "trajectories") as bar:
+        filmed = exports.blocks(recorded, film, bar.advance) if pixels else None
+        if not pixels:  # nothing that takes time
+            bar.advance(len(recorded))
+        if kind == "hdf5":
+            exports.write_hdf5(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
+        else:
+            exports.write_npz(target, values, filmed, about)
+    size_bytes = target.stat().st_size
+    names = [*values, *(["pixels"] if pixels else [])]
+    screen.say(f"{len(recorded)} trajectories, {', '.join(sorted(names))}: {target}")
+    return {
+        "dataset": str(data.path),
+        "split": split,
+        "file": str(target),
+        "format": kind,
+        "rows": len(values["state"]),
+        "columns": sorted(names),
+        "size_bytes": size_bytes,
+    }
+
+
+def opened(path: Path | None, screen: Screen) -> Dataset:
+    """The dataset at ``path``, or the newest in data/."""
+    if path is None:
+        path = newest()
+        screen.say(f"newest dataset, {path}")
+    return load_dataset(path)
+
+
+def newest() -> Path:
+    """The newest dataset in data/."""
+    path = find_newest_dataset(ROOT)
+    if path is None:
+        raise MissingInputError(f"no dataset in {ROOT}/", hint="hjepa collect")
+    return path
+
+
+def summary(data: Dataset) -> Result:
+    """What the manifest says."""
+    return {
+        "dataset": str(data.path),
+        "plant": data.plant,
+        "frames": data.frames,
+        "sha256": data.digest,
+        "size_bytes": sum(file.stat().st_size for file in data.path.glob("*") if file.is_file()),
+        "splits": {
+            name: {
+                "trajectories": split["trajectories"],
+                "steps": split["steps"],
+                "shards": len(split["shards"]),
+            }
+            for name, split in data.splits.items()
+        },
+    }
+
+
+def spread(split: Trajectories) -> list[list[float]]:
+    """[least, greatest] of each state and of each applied force."""
+    driven = split.applied_n.reshape(len(split), split.steps, -1)
+    series = [*np.moveaxis(split.states, -1, 0), *np.moveaxis(driven, -1, 0)]
+    return [[float(values.min()), float(values.max())] for values in series]
+
+
+def labels(plant_name: str) -> list[str]:
+    """What :func:`spread` is of: ``x [m]``, …, ``force [N]``."""
+    system = plant(plant_name)
+    states = zip(system.state_names, system.state_units, strict=True)
+    count = math.prod(system.action_shape)
+    numbers = [""] if count == 1 else [f" {number}" for number in range(1, count + 1)]
+    return [*(f"{name} [{unit}]" for name, unit in states), *(f"force{n} [N]" for n in numbers)]
+
+
+def forces(applied_n: np.ndarray) -> str:
+    """``+1.5 N``, or ``+0.2 -0.1 N`` where there are several."""
+    return " ".join(f"{force:+.1f}" for force in applied_n.reshape(-1)) + " N"
+
+
+def interval(ends: Sequence[float]) -> str:
+    """``-0.31 … 0.28``."""
+    return " … ".join(f"{end:.3g}" for end in ends)
+
+
+def chosen_format(out: Path | None, kind: str | None) -> str:
+    """The format that was named, else that of the file's suffix, else npz.
+
+    Raises:
+        UsageError: the suffix is that of no format, or of another than the one that was named.
+    """
+    if out is None:
+        return kind or "npz"
+    meant = next((name for name, suffixes in FORMATS.items() if out.suffix in suffixes), None)
+    if kind and meant and kind != meant:
+        raise UsageError(
+            f"--format {kind} contradicts the suffix of {out}",
+            hint=f"--format {meant}, or --out {out.with_suffix(FORMATS[kind][0])}",
+        )
+    if not (kind or meant):
+        raise UsageError(
+            f"no export format has the suffix of {out}",
+            hint="--format hdf5 or --format npz; or --out FILE.h5 or FILE.npz",
+        )
+    return kind or str(meant)
+
+
+def plan_export(
+    path: Path | None, out: Path | None, split: str, kind: str | None, pixels: bool
+) -> Plan:
+    """Plan of ``hjepa data export``."""
+    kind = chosen_format(out, kind)
+    data = load_dataset(path or newest())
+    described = data.splits[split]
+    rows = described["trajectories"] * (described["steps"] + 1)
+    system = plant(data.plant)
+    row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
+    frames = rows if pixels else 0
+    work = [f"gather {rows} rows of split {split}"]
+    if frames and data.frames == "rendered":
+        work.append(f"render {frames} frames")
+    return Plan(
+        command="data export",
+        reads=[f"dataset {data.path}"],
+        work=work,
+        writes=[f"{kind} file {out or default_name(data, split, kind)}"],
+        writes_bytes=rows * row_bytes + frames * COMPRESSED_FRAME_BYTES,
+        seconds=1 + frames / RATES_PER_S["rendered frames"] + frames / COMPRESSED_FRAMES_PER_S,
+    )
+
+
+def default_name(data: Dataset, split: str, kind: str) -> Path:
+    """Where an export goes without --out."""
+    return Path(f"{data.path.name}-{split}{FORMATS[kind][0]}")

@@ -1,0 +1,371 @@
+"""Reports: one file that needs nothing else, and nothing in it that a name could smuggle in."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from command_line import assert_one_line_error, open_shell
+
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.output import html
+from hjepa_cli.stages import report
+from hjepa_cli.storage.runs import Run
+
+pytest.importorskip("matplotlib")
+from hjepa_cli.output import figures
+
+EVIL = '<script>alert("x")</script>&'
+
+
+class Reader(HTMLParser):
+    """Tags and texts of a page; checks that every tag is closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.links, self.texts = [], [], [], []
+        self.feed(text)
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.links += [value for name, value in attributes if name in ("src", "href")]
+        assert not any(name.startswith("on") for name, _ in attributes)
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def entry(score):
+    """One method of an evaluation, shaped as ``eval --json`` prints it."""
+    curve = [
+        {"score": score / gap, "ci95": [0.9 * score / gap, 1.1 * score / gap]} for gap in (1, 2, 8)
+    ]
+    return {
+        "nmae": [0.01, 0.02, 0.03],
+        "nmae_ci95": [[0.009, 0.011], [0.019, 0.021], [0.029, 0.031]],
+        "nmae_windows": {"1-20": 0.025},
+        "score": score,
+        "score_ci95": [score - 0.1, score + 0.1],
+        "lq_ratio": 0.8,
+        "bits_per_transmission": 2064,
+        "gap_curve": [p | {"d": d} for p, d in zip(curve, (1, 2, 8), strict=True)],
+        "delivery_curve": [p | {"p": 1 / d} for p, d in zip(curve, (1, 2, 8), strict=True)],
+        "tolerance_gap_steps": 81.25,
+        "tolerance_gap_ci95": [75.0, 90.5],
+        "tolerance_gap_censored": False,
+        "tolerance_p": 0.0125,
+        "tolerance_p_ci95": [0.01, 0.02],
+        "tolerance_p_censored": True,
+        "n_curve_devices": 64,
+        "n_devices": 256,
+        "n_rollouts": 40,
+    }
+
+
+def finished(stage, result, metrics=(), name=None):
+    settings = load_settings().as_dict()
+    with Run.create(stage, Path("runs") / stage / name if name else None, settings) as record:
+        for row in metrics:
+            record.metric(row)
+        record.finish(result)
+        return record.directory
+
+
+def evaluated(name=None, plant="desktop"):
+    methods = {"hjepa": entry(0.95), EVIL: entry(0.5)}
+    document = {"plant": plant, "seed": 0, "checkpoint": f"m/{EVIL}", "methods": methods}
+    return finished("eval", document, name=name)
+
+
+def scaled():
+    rows = [
+        {
+            "snr_db": snr,
+            "method": method,
+            "bits_per_s": 12345.6,
+            "at_least": method == "hold",
+            "devices": n * snr,
+            "devices_ci95": [n * snr, n * snr + 7],
+        }
+        for snr in (10.0, 20.0)
+        for method, n in (("hjepa", 111), ("hold", 50))
+    ]
+    gain = {"method": "hjepa", "over": "hold", "snr_db": 20.0, "ratio": 2.22}
+    document = {
+        "law": "duty", "bandwidth_hz": 20e6, "slot_s": 1e-3, "limit_bits_per_s": 13.2,
+        "acceptable_score": 0.62, "rows": rows, "gains": [gain | {"ratio_ci95": [2.0, None]}],
+        "paper_gain_percent": 42.83, "checkpoint": None, "seed": 0, "n_devices": 256,
+    }  # fmt: skip
+    return finished("scale", document)
+
+
+def trained():
+    gates = {
+        "effective_rank": {"value": 3.0, "threshold": 4.0, "passed": False},
+        "probe_r2_theta": {"value": 0.9, "threshold": 0.8, "passed": True},
+        "probe_r2_x": {"value": 0.97, "threshold": 0.95, "passed": True},
+        "actor_nrmse": {"value": 0.2, "threshold": 0.35, "passed": True},
+    }
+    rows = [
+        {"step": step, "loss_prediction": 1 / step, "probe_r2_x": 0.5, "probe_r2_theta": None}
+        for step in (1, 2, 3)
+    ]
+    document = {"checkpoint": "c", "seconds": 3.0, "gates": gates}
+    return finished("train-encoder", document, rows)
+
+
+@pytest.fixture
+def without_figures(monkeypatch):
+    """They take most of the time."""
+    monkeypatch.setattr(report, "draw", lambda figures_of, screen: {})
+
+
+@pytest.fixture
+def shell(tmp_path, monkeypatch, capsys):
+    return open_shell(tmp_path, monkeypatch, capsys)
+
+
+def test_a_report_is_self_contained_and_well_formed(shell):
+    scaled(), evaluated(), trained()
+    document = shell("report", "--json").document
+    assert document["report"] == "report.html"
+    assert document["runs"] == ["runs/scale/0001", "runs/eval/0001", "runs/train-encoder/0001"]
+    text = Path("report.html").read_text()
+    page = Reader(text)
+    assert "script" not in page.tags and "link" not in page.tags and "iframe" not in page.tags
+    pictures = [link for link in page.links if link.startswith("data:image/svg+xml;base64,")]
+    assert pictures == page.links and len(pictures) == 1 + 3 + 1
+    for picture in pictures:
+        ElementTree.fromstring(base64.b64decode(picture.partition(",")[2]))
+    assert not re.search(r"https?://", text)
+
+
+def test_a_report_shows_numbers_intervals_settings_and_commands(shell, without_figures):
+    scaled(), evaluated(), trained()
+    shell("report")
+    said = " ".join(Reader(Path("report.html").read_text()).texts)
+    for text in (
+        *("1110 (1110 – 1117)", "≥ 500 (500 – 507)", "12,346"),
+        "+122.0 % (+100.0 % to unbounded) devices",
+        "hjepa eval --config runs/eval/0001/config.toml",
+        *("effective_rank 3 ≥ 4 FAILED", "actor_nrmse 0.2 ≤ 0.35 passed"),
+        *("0.950 (0.850 – 1.050)", "81.2 (75.0 – 90.5)", "≤ 0.0125 (0.0100 – 0.0200)"),
+        *("256 devices", "effective_rank", "FAILED", "[protocol]", "version of torch"),
+        "hjepa scale --config runs/scale/0001/config.toml",
+    ):
+        assert text in said, text
+
+
+def test_rows_are_in_the_order_of_the_settings_and_the_states(shell, without_figures):
+    """Not in that of the alphabet, in which results are stored."""
+    methods = {name: entry(0.9) for name in ("oracle", "hold", "hjepa")}
+    finished("eval", {"plant": "desktop", "seed": 0, "checkpoint": "m", "methods": methods})
+    trained()
+    shell("report")
+    first = [row[0] for row in rows_of(Path("report.html").read_text())]
+    methods_at = [first.index(name) for name in ("hjepa", "hold", "oracle")]
+    assert methods_at == sorted(methods_at)
+    gates_at = [first.index(name) for name in ("probe_r2_x", "probe_r2_theta", "effective_rank")]
+    assert gates_at == sorted(gates_at)
+
+
+def test_strides_are_told_from_the_highest_level_on(shell, without_figures):
+    strides = {"l": 1, "m": 2, "h": 8}
+    finished("train-hierarchy", {"checkpoint": "c", "seconds": 1, "strides": strides,
+             "nmae_windows": {}})  # fmt: skip
+    shell("report")
+    assert "strides 8/2/1" in Path("report.html").read_text()
+
+
+def test_the_commands_name_what_the_run_was_given(shell, without_figures):
+    given = {
+        name: {"path": str(Path(path).absolute()), "sha256": "0"}
+        for name, path in (("dataset", "data/d"), ("encoder", "e/model.safetensors"))
+    }
+    settings = load_settings().as_dict()
+    with Run.create("train-hierarchy", None, settings, given | {"remeasure": False}) as record:
+        record.finish({"checkpoint": "c", "seconds": 1, "strides": dict.fromkeys("hml", 1),
+                       "nmae_windows": {}})  # fmt: skip
+    shell("report")
+    command = "config.toml --dataset data/d --encoder e/model.safetensors"
+    assert command in Path("report.html").read_text()
+
+
+def test_further_models_have_no_flag(shell):
+    """Each method's model is looked for again: `hjepa eval` takes one --checkpoint."""
+    given = {name: {"path": f"/{name}"} for name in ("checkpoint", "checkpoint 2", "checkpoint 3")}
+    assert report.inputs_of({"inputs": given}) == ["--checkpoint", "/checkpoint"]
+
+
+def test_a_smoke_run_is_called_one(shell, without_figures):
+    trained()
+    shell("report")
+    assert "mean nothing" not in Path("report.html").read_text()
+    with Run.create("train-encoder", None, load_settings("smoke").as_dict()) as record:
+        record.finish({"checkpoint": "c", "seconds": 1.0, "gates": {}})
+    shell("report")
+    assert "mean nothing" in Path("report.html").read_text()
+
+
+def rows_of(text):
+    """The texts of every table's rows."""
+    found = re.findall(r"<tr>(.*?)</tr>", text)
+    return [[*map(re.compile(r"<[^>]*>").sub, [""] * 99, re.findall(r"<t[dh].*?</t[dh]>", row))]
+            for row in found]  # fmt: skip
+
+
+def test_names_cannot_smuggle_markup_in(shell, without_figures):
+    evaluated(name="a&b<i>")
+    assert shell("report", "runs/eval/a&b<i>").code == 0
+    text = Path("report.html").read_text()
+    page = Reader(text)
+    assert "script" not in page.tags and "i" not in page.tags
+    assert EVIL in "".join(page.texts) and "runs/eval/a&b<i>" in "".join(page.texts)
+
+
+@pytest.mark.parametrize("text", [EVIL, "a\"'b", "<b", "&lt;"])
+def test_every_helper_escapes(text):
+    for markup in (
+        html.heading(2, text),
+        html.paragraph(text),
+        html.code(text),
+        html.table([text], [[text]]),
+        html.pairs({text: text}),
+        html.page(text, []),
+        html.picture(b"", "png", text),
+        html.details(text, ""),
+    ):
+        assert text in "".join(Reader(markup).texts) or "<img" in markup
+        assert "<script" not in markup and "<b" not in markup.replace("<body", "")
+
+
+def test_equal_runs_give_equal_reports(shell):
+    scaled()
+    shell("report", "--out", "a.html")
+    shell("report", "--out", "b.html")
+    assert Path("a.html").read_bytes() == Path("b.html").read_bytes()
+
+
+def test_figures_are_written_in_the_formats_asked_for(shell):
+    finished("train-hierarchy", {"checkpoint": "c", "seconds": 1,
+             "strides": dict.fromkeys("hml", 1), "nmae_windows": {}},
+             [{"level": "high", "step": step, "loss": 0.5} for step in (1, 2)])  # fmt: skip
+    arguments = ["report", "runs/train-hierarchy/0001", "--figures", "f", "--format", "pdf,png"]
+    document = shell(*arguments, "--json").document
+    names = {f"f/train-hierarchy-training.{kind}" for kind in ("pdf", "png")}
+    assert set(document["figures"]) == names
+    for name in names:
+        data = Path(name).read_bytes()
+        assert data.startswith(b"%PDF" if name.endswith("pdf") else b"\x89PNG")
+        assert b"/Type3" not in data
+    assert_one_line_error(shell("report", "--format", "bmp"), 2, "bmp", "svg")
+
+
+def test_a_directory_of_runs_is_all_of_its_runs(shell, without_figures):
+    scaled(), evaluated()
+    assert len(shell("report", "runs", "--json").document["runs"]) == 2
+
+
+def test_runs_of_another_version_say_what_to_do(shell, without_figures, monkeypatch):
+    directory = evaluated()
+    monkeypatch.setattr("hjepa_cli.stages.report.__version__", "9.9.9")
+    shell("report")
+    text = Path("report.html").read_text()
+    assert "9.9.9" in text and f"hjepa eval --config {directory}/config.toml" in text
+
+
+def test_what_is_no_run_is_refused(shell):
+    with shell.untouched():
+        assert_one_line_error(shell("report"), 66, "no finished run")
+        assert_one_line_error(shell("report", "nowhere"), 66, "nowhere")
+    with Run.create("eval", None, load_settings().as_dict()):
+        pass
+    assert_one_line_error(shell("report", "runs/eval/0001"), 66, "unfinished")
+    finished("scale", {"law": "duty"})
+    assert_one_line_error(shell("report", "runs/scale/0001"), 65, "result.json", "rows")
+
+
+# --- the figures
+
+
+def test_score_figure_draws_each_curve_with_its_band():
+    figure = figures.score_figure(
+        {"hjepa": entry(0.9), "hold": entry(0.6)}, "gap", acceptable_score=0.62, step_s=1e-3
+    )
+    (axes,) = figure.axes
+    lines = {line.get_label(): line for line in axes.lines}
+    np.testing.assert_allclose(lines["hjepa"].get_xdata(), [1, 2, 8])
+    np.testing.assert_allclose(lines["hold"].get_ydata(), [0.6, 0.3, 0.075])
+    corners = axes.collections[0].get_paths()[0].vertices
+    assert corners[:, 1].max() == pytest.approx(0.99) and (8.0, 0.10125) in [
+        (x, pytest.approx(y)) for x, y in corners
+    ]
+    other = figures.score_figure({"hjepa": entry(0.9)}, "delivery", acceptable_score=0.62,
+                                 step_s=1e-3)  # fmt: skip
+    assert other.axes[0].xaxis_inverted()
+
+
+def test_error_figure_leaves_out_who_makes_no_error():
+    exact = entry(1.0) | {"nmae": [1e-8] * 3, "nmae_ci95": [[0, 1e-8]] * 3}
+    figure = figures.error_figure({"hjepa": entry(0.9), "oracle": exact}, step_s=20e-3)
+    (line,) = figure.axes[0].lines
+    assert line.get_label() == "hjepa" and list(line.get_xdata()) == [0, 20, 40]
+    assert figure.axes[0].get_ylim()[0] > 1e-3
+
+
+def test_a_report_of_those_who_make_no_error_has_no_empty_figure(shell):
+    """Nor a warning about a legend without names: warnings are errors here."""
+    exact = entry(1.0) | {"nmae": [1e-8] * 3, "nmae_ci95": [[0, 1e-8]] * 3}
+    unlinked = exact | {"tolerance_gap_steps": None}
+    for name, methods, count in (("o", {"oracle": exact}, 2), ("p", {"optimal": unlinked}, 0)):
+        finished("eval", {"plant": "desktop", "seed": 0, "checkpoint": None, "methods": methods},
+                 name=name)  # fmt: skip
+        outcome = shell("report", f"runs/eval/{name}")
+        assert (outcome.code, "Warning" in outcome.err) == (0, False)
+        assert Path("report.html").read_text().count("<img") == count
+
+
+def test_training_figure_has_a_line_per_loss_level_and_health_measure():
+    rows = [{"step": "1", "loss_a": "0.5", "loss_b": "2", "probe_r2_x": "0.9", "std": "1"}]
+    figure = figures.training_figure(rows)
+    assert [[line.get_label() for line in axes.lines] for axes in figure.axes] == [
+        ["a", "b"],
+        ["x"],
+    ]
+    levels = [{"level": name, "step": "5", "loss": "1"} for name in ("high", "low")]
+    (axes,) = figures.training_figure(levels).axes
+    assert [line.get_label() for line in axes.lines] == ["high", "low"]
+
+
+def test_a_run_of_reflexes_has_its_section(shell, without_figures):
+    windows = {"1-20": 0.0571, "21-40": 0.04}
+    document = {
+        "checkpoint": "r/model.safetensors",
+        "seconds": 200.0,
+        "n_rollouts": 40,
+        "reflex": {
+            "gain": 2.61,
+            "tau_steps": 6.88,
+            "law": {"gain": 1.31, "tau_steps": 9.21, "gains_n": [[-21.5, -6.2, -48.2, -3.8]]},
+        },
+        "nmae_windows": dict.fromkeys(("hold-decay", "hold-decay-linear", "chunk"), windows),
+    }
+    made = finished("train-reflex", document)
+    assert shell("report", made, "--json").code == 0
+    text = (shell.directory / "report.html").read_text()
+    for part in ("Reflexes, r/model.safetensors", "0.0571", "2.61", "9.21", "chunk"):
+        assert part in text, part
+
+
+def test_runs_that_no_report_shows_are_refused(shell):
+    made = finished("collect", {"dataset": "d"})
+    assert_one_line_error(shell("report", made), 66, "no run of train-encoder")

@@ -1,0 +1,320 @@
+"""Animations: what they show is what happened, and what the controller had in its hands."""
+
+import io
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import assert_one_line_error, open_shell
+from test_evaluate import untrained
+
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.controllers import StrideController
+from hjepa_cli.core.control.loop import Draws, every_step, simulate
+from hjepa_cli.core.control.methods import true_state_method
+from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.stages.view import Believer, Film, Link, make_link
+
+image_module = pytest.importorskip("PIL.Image")
+from hjepa_cli.output import (
+    animation,  # noqa: E402 - needs Pillow
+    live,  # noqa: E402 - needs Pillow
+)
+
+SMALL = """
+[collect]
+trajectories = 3
+steps = 9
+[protocol]
+steps = 12
+"""
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return untrained(tmp_path_factory.mktemp("model") / "model.safetensors")
+
+
+@pytest.fixture
+def shell(tmp_path, monkeypatch, capsys):
+    shell = open_shell(tmp_path, monkeypatch, capsys)
+    Path("small.toml").write_text(SMALL)
+    return shell
+
+
+class Counting:
+    """A planner whose embedding counts control steps."""
+
+    stride = 4
+
+    def plan(self, z):
+        return torch.zeros(len(z), 4), z + 4
+
+
+# --- beliefs
+
+
+def test_belief_is_the_step_that_a_counting_planner_has_reached():
+    """After a packet worth z the controller believes z + j, j steps later, whatever the phase."""
+    controller = StrideController(Counting(), devices=2)
+    believer = Believer(controller, torch.tensor([[1.0], [0.0]], dtype=torch.float64))
+    packets = {0: [10.0, 20.0], 3: [100.0], 9: [200.0]}
+    arrivals = {0: [True, True], 3: [False, True], 9: [True, False]}
+    expected = np.array([10.0, 20.0])
+    for k in range(15):
+        delivered = np.array(arrivals.get(k, [False, False]))
+        received = torch.tensor(packets[k])[:, None] if k in packets else None
+        if k in packets:
+            expected[delivered] = packets[k]
+        believer.act(delivered, received)
+        np.testing.assert_allclose(believer.believed[-1][:, 0], expected)
+        expected += 1
+
+
+def test_a_probe_reads_what_embeddings_hold_linearly():
+    random = torch.Generator().manual_seed(0)
+    states = torch.randn(300, 4, generator=random)
+    z = states @ torch.randn(4, 16, generator=random) + 3.0
+    probe = health.fit_probe(z[:200], states[:200])
+    torch.testing.assert_close(
+        health.read_probe(probe, z[200:]), states[200:].double(), atol=1e-4, rtol=0
+    )
+
+
+def test_watching_a_loop_sees_every_state_and_force():
+    settings = load_settings("smoke")
+    draws = Draws.make(settings.protocol, 2, 0)
+    method = true_state_method("optimal", plant("desktop"), 1)
+    sensed, watched = [], []
+
+    def sensor(seen):
+        sensed.append(seen[:, -1].copy())
+        return seen[:, -1]
+
+    simulate(
+        plant("desktop"),
+        draws,
+        every_step(draws.steps, 2)[None],
+        method.controller(2),
+        sensor,
+        watch=lambda k, states, forces_n: watched.append((k, states.copy(), forces_n.copy())),
+    )
+    assert [k for k, *_ in watched] == list(range(draws.steps))
+    np.testing.assert_array_equal([states for _, states, _ in watched], sensed)
+    assert (np.abs([forces for *_, forces in watched]) <= 20).all()
+
+
+# --- the link
+
+
+def test_fading_delivers_the_share_that_was_asked_for(checkpoint):
+    settings = load_settings(flags={"seed": 1})
+    model = Model.load(checkpoint, "cpu")
+    link = make_link(settings, model, 4, snr_db=20.0, delivery=0.2, gap_steps=None)
+    # 4,000 slots: standard error sqrt(0.2 * 0.8 / 4000) = 0.0063; five of them
+    assert link.delivered.mean() == pytest.approx(0.2, abs=0.032)
+    weakest = link.snr_db[1:][link.delivered[1:]].min()
+    assert weakest > link.snr_db[1:][~link.delivered[1:]].max()
+    assert np.mean(10 ** (link.snr_db / 10)) == pytest.approx(100, rel=0.08)  # 5 / sqrt(4000)
+    wider = make_link(settings, model, 9, snr_db=20.0, delivery=0.2, gap_steps=None)
+    np.testing.assert_array_equal(wider.delivered[:, :4], link.delivered)
+
+
+def test_a_periodic_link_loses_nothing(checkpoint):
+    model = Model.load(checkpoint, "cpu")
+    link = make_link(
+        load_settings(flags={"protocol": "paper"}),
+        model,
+        2,
+        snr_db=10.0,
+        delivery=0.5,
+        gap_steps=80,
+    )
+    assert np.flatnonzero(link.delivered[:, 0]).tolist() == list(range(0, 1000, 80))
+    assert not link.sends_always and (link.snr_db == 10).all()
+
+
+# --- pictures
+
+
+def pictures(steps=300, devices=2, every=10):
+    """An animation of a made-up loop: one row, the belief a little off the truth."""
+    random = np.random.default_rng(0)
+    delivered = random.random((steps, devices)) < 0.1
+    delivered[0] = True
+    link = Link(delivered, random.normal(20, 3, (steps, devices)), True, "made up")
+    states = np.zeros((steps, devices, 4))
+    states[..., 0] = 0.02
+    states[..., 2] = 0.1
+    believed = states + np.array([0.0, 0, 0.2, 0])
+    film = Film("hjepa", states, believed, np.ones((steps, devices), bool))
+    kind = plant("desktop")
+    return animation.Pictures([film], link, kind, kind.camera(), every)
+
+
+def test_age_counts_from_the_last_arrival():
+    shots = pictures()
+    for device in range(2):
+        age = 0
+        for k, arrived in enumerate(shots.link.delivered[:, device]):
+            age = 0 if arrived else age + 1
+            assert shots.age_steps(device, k) == age
+
+
+def test_the_strip_shows_every_slot_of_the_last_while():
+    shots = pictures()
+    k = 290
+    panel = np.asarray(shots._panel(shots.films[0], 1, k))
+    row = panel[-4]  # above the ticks
+    for column in range(animation.PANEL_PX[0]):
+        slot = k - (animation.PANEL_PX[0] - 1 - column)
+        nearby = shots.link.delivered[slot : slot + 2, 1]  # a bar is two columns wide
+        assert (tuple(row[column]) == animation.ARRIVED) == nearby.any(), column
+
+
+def test_the_belief_is_drawn_where_it_is():
+    """The dashed line ends at the believed tip, the red pole at the true one."""
+    shots = pictures()
+    panel = np.asarray(shots._panel(shots.films[0], 0, 0)).astype(int)[16 : 16 + 128]
+    scale = 2 * shots._camera.scale_px_m
+    pivot = np.array([128 + 0.02 * scale, 96])
+    dark = panel.sum(axis=-1) < 60  # black dashes
+    for angle, is_there in ((0.3, True), (-0.3, False)):
+        along = [
+            pivot + 0.2 * share * scale * np.array([np.sin(angle), -np.cos(angle)])
+            for share in np.linspace(0.5, 0.95, 40)
+        ]
+        hits = sum(dark[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2].any()
+                   for x, y in along)  # fmt: skip
+        assert (hits > 15) == is_there
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 30), (40, 24), (200, 60)])
+def test_terminal_pictures_fit_the_terminal(width, height):
+    shots = pictures()
+    lines = rendered(shots, 50, width, height)
+    assert max(map(len, lines)) <= width and len(lines) <= height - 1
+    text = "\n".join(lines)
+    assert text.count("ms old") == 2 and "▀" in text and "hjepa, 50 ms" in text
+    assert text.count("theta off by +11.5°") == 2
+
+
+def rendered(shots, k, width, height):
+    """A picture of the terminal as lines without colours."""
+    from rich.console import Console
+
+    console = Console(file=io.StringIO(), width=width, height=height, color_system=None)
+    console.print(live.terminal_picture(shots, k, width, height))
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+def test_the_terminal_marks_what_arrived_and_what_was_lost():
+    """A character per picture, the newest at the right."""
+    shots = pictures(steps=300, devices=1, every=10)
+    (strip,) = (line for line in rendered(shots, 290, 80, 24) if line.strip("█· ") == "")
+    slots = shots.link.delivered[1:291, 0].reshape(29, 10).any(axis=1)
+    assert strip.lstrip()[1:] == "".join("█" if arrived else "·" for arrived in slots)
+
+
+def test_the_terminal_shows_where_the_controller_believes_the_pole_to_be():
+    shots = pictures(devices=1)
+    scene = live._scene(shots, shots.films[0], 0, 0, 64)
+    black = {span.start for span in scene.spans if "#000000" in str(span.style)}
+    columns = [start % 65 for start in black]  # a line is 64 characters and its end
+    pivot = 32 + 0.02 * 64 / 0.6
+    tip = pivot + np.sin(0.3) * 0.2 * 64 / 0.6  # believed at 0.3 rad, true at 0.1
+    assert min(columns) == pytest.approx(pivot, abs=1) and max(columns) == pytest.approx(tip, abs=1)
+
+
+# --- the command
+
+
+def test_view_writes_the_same_gif_twice(shell, checkpoint):
+    arguments = ["view", "--checkpoint", checkpoint, "--config", "small.toml", "--devices", "1"]
+    arguments += ["--every", "3", "--delivery", "0.5", "--json"]
+    document = shell(*arguments).document
+    assert document["pictures"] == 4 and document["file"] == "hjepa-view.gif"
+    assert document["methods"].keys() == {"hjepa", "hold"}
+    first = Path("hjepa-view.gif").read_bytes()
+    image = image_module.open(io.BytesIO(first))
+    assert image.n_frames == 4 and image.info["duration"] == 50 and image.info["loop"] == 0
+    shell(*arguments, "--out", "again.gif")
+    assert Path("again.gif").read_bytes() == first
+    left = {path.name for path in Path().iterdir()}
+    assert left == {"small.toml", "hjepa-view.gif", "again.gif"}
+
+
+def test_a_gif_keeps_the_colours_of_the_strip(tmp_path):
+    """Few pixels have them: a palette of the commonest colours would not."""
+    shots, path = pictures(steps=30), tmp_path / "a.gif"
+    animation.write(shots, path, 10, lambda: None)
+    with image_module.open(path) as image:
+        image.seek(image.n_frames - 1)
+        shown = np.asarray(image.convert("RGB")).reshape(-1, 3)
+    for colour in (animation.ARRIVED, animation.LOST):
+        assert (np.abs(shown.astype(int) - colour).max(axis=1) <= 1).any(), colour
+
+
+@pytest.mark.parametrize(("fps", "shown_ms"), [(1, 1000), (24, 40), (30, 30), (45, 20), (50, 20)])
+def test_the_rate_that_is_told_is_the_gif_s(tmp_path, fps, shown_ms):
+    path = tmp_path / "a.gif"
+    animation.write(pictures(steps=20), path, fps, lambda: None)
+    with image_module.open(path) as image:
+        assert image.info["duration"] == shown_ms
+    assert animation.true_fps(path, fps) == pytest.approx(1000 / shown_ms)
+    assert animation.true_fps(Path("a.mp4"), fps) == fps
+
+
+def test_view_tells_the_rate_that_it_wrote(shell, checkpoint):
+    arguments = ("view", "--checkpoint", checkpoint, "--config", "small.toml", "--every", "6")
+    assert "2 pictures at 33.3 per second" in shell(*arguments, "--fps", "30").err
+
+
+def test_view_writes_mp4(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    import imageio_ffmpeg
+
+    shots, path = pictures(steps=40), tmp_path / "a.mp4"
+    animation.write(shots, path, 10, lambda: None)
+    read = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run(read, capture_output=True, check=True)
+    width, height = shots.size_px
+    frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3).astype(int)
+    assert len(frames) == len(shots) == 4
+    for shown, drawn in zip(frames, shots, strict=True):  # lossy, but the same picture
+        assert np.abs(shown - np.asarray(drawn)).mean() < 6
+
+
+def test_a_folder_for_the_file_is_made_before_anything_is_simulated(shell, checkpoint, monkeypatch):
+    monkeypatch.setattr("hjepa_cli.stages.view.film", lambda *_: pytest.fail("simulated"))
+    Path("file").write_text("")
+    outcome = shell("view", "--out", "file/a.gif", "--checkpoint", checkpoint, "--quiet")
+    assert_one_line_error(outcome, 74, "file")
+    monkeypatch.undo()
+    arguments = ("view", "--checkpoint", checkpoint, "--config", shell.directory / "small.toml")
+    monkeypatch.chdir(shell.directory)
+    assert shell(*arguments, "--every", "12", "--out", "new/a.gif", "--quiet").code == 0
+    assert Path("new/a.gif").stat().st_size > 0
+
+
+def test_dry_run_says_what_would_be_drawn(shell, checkpoint):
+    with shell.untouched():
+        outcome = shell("view", "--checkpoint", checkpoint, "--dry-run", "--devices", "5")
+    assert outcome.code == 0 and "5 devices" in outcome.out and "hjepa-view.gif" in outcome.out
+
+
+def test_what_cannot_be_viewed_is_refused(shell, checkpoint):
+    small = ["--checkpoint", checkpoint, "--config", "small.toml", "--quiet"]
+    with shell.untouched():
+        oracle = ["view", "--methods", "oracle", *small]
+        assert_one_line_error(shell(*oracle), 2, "oracle", "hjepa")
+        assert_one_line_error(shell(*oracle, "--dry-run"), 2, "oracle", "hjepa")
+        assert_one_line_error(shell("view", "--out", "a.avi", *small), 2, ".avi", ".mp4")
+        assert_one_line_error(shell("view", "--fps", "60", *small), 2, "--fps 60", "50", ".mp4")
+        assert_one_line_error(shell("view", "--live", *small), 2, "terminal")
+        assert_one_line_error(shell("view", "--delivery", "0", *small), 2, "--delivery")
+        assert_one_line_error(shell("view", "--snr", "nan", *small), 2, "--snr")
