@@ -210,3 +210,13 @@ def test_curve_entries_carry_score_interval_and_cost_ratio() -> None:
         assert entry["in_band"] == pytest.approx(scores.mean())
         assert entry["lq_ratio"] == pytest.approx(0.4)
         assert entry["n_devices"] == 64
+
+
+def test_at_a_cliff_the_interval_is_as_wide_as_the_search_looks_closely() -> None:
+    """All devices fall at once: resampling them says nothing of where, the bracket does."""
+    curves = Fake(lambda gap: 0.9 if gap < 93.7 else 0.1).curves()
+    for kind in KINDS:
+        found = curves.searches[kind].result()
+        low, high = found.interval
+        assert low <= 93.7 <= high and low <= found.gap <= high
+        assert 1.0 < high / low <= 1 + PROTOCOL.bracket

@@ -172,9 +172,18 @@ class Search:
         return [Point(self.kind, gap) for gap in self._next() if gap not in self._measured]
 
     def result(self) -> Tolerance:
-        """The crossing and its interval from the points with many devices."""
+        """Return the crossing and its interval from the points with many devices.
+
+        Between the two points around it the crossing is only interpolated, so that the interval
+        reaches at least from the one to the other.
+        """
         crossing = float(self._cross(self._reference.relative_score(self.outcome)))
         low, high = self._interval()
+        if math.isfinite(crossing):
+            gaps = sorted(self._measured)
+            right = int(np.searchsorted(gaps, crossing))
+            low = min(low, gaps[max(right - 1, 0)])
+            high = max(high, gaps[min(right, len(gaps) - 1)])
         return Tolerance(
             self._bounded(crossing), (self._bounded(low), self._bounded(high)), crossing == math.inf
         )
