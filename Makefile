@@ -1,6 +1,6 @@
 # make demo   how many cart-poles a radio cell supports: installs, prints the table, draws the figure
 # make test   installs and runs the tests; make test ARGS='-k camera' runs some
-# make lint   ruff on everything, mypy --strict on hjepa_cli/core
+# make lint   ruff on everything, mypy --strict on hjepa_cli/core, who may import whom
 # make clean  removes .venv and what tools leave behind
 #
 # PYTHON=python3.12 chooses the interpreter (3.11 or newer).
@@ -22,6 +22,7 @@ lint:
 	@scripts/venv lint
 	.venv/bin/ruff check .
 	.venv/bin/mypy
+	.venv/bin/lint-imports --no-cache --no-logo
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache dist

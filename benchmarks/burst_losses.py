@@ -13,8 +13,8 @@ import math
 import numpy as np
 
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.loop import Draws, every_step, simulate
-from hjepa_cli.core.control.methods import build_method
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.fading import gilbert_elliott
@@ -33,7 +33,7 @@ def main() -> None:
     settings = load_settings()
     protocol, kind, seed = settings.protocol, plant(settings.plant), settings.seed
     model = Model.load(zoo.resolve_model(options.checkpoint)) if options.checkpoint else None
-    method = build_method(options.method, settings, model)
+    method = build_driver(options.method, settings, model)
     draws = Draws.make(protocol, options.devices, seed)
 
     def scores(schedules: np.ndarray, which: object) -> np.ndarray:
@@ -41,7 +41,7 @@ def main() -> None:
         return simulate(kind, draws, schedules, controller, which.sensor).score
 
     everything = every_step(protocol.total_steps, options.devices)[None]
-    reference = scores(everything, build_method("optimal", settings, None))[0]
+    reference = scores(everything, build_driver("optimal", settings, None))[0]
     weights = bootstrap_weights(options.devices, protocol.bootstrap, seed)
     gaps = np.array([float(gap) for gap in options.gaps.split(",")])
     print(f"{options.method}, {options.devices} devices, {protocol.total_steps} steps, seed {seed}")

@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.evaluation.cell_simulation import measure_growth, simulate_cell
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant
@@ -40,7 +40,7 @@ def main() -> None:
     model = Model.load(zoo.resolve_model(options.checkpoint)) if options.checkpoint else None
     settings = load_settings()
     kind = plant(settings.plant)
-    method = build_method(options.method, settings, model)
+    method = build_driver(options.method, settings, model)
     growth = measure_growth(kind, settings.protocol, 1, method, longest=100)
     for scheduler in options.schedulers.split(","):
         for steps, devices in itertools.product(

@@ -16,13 +16,16 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from hjepa_cli.config.checks import ANCHORS, TRUE_STATE
-from hjepa_cli.config.settings import Settings, load_settings
+from hjepa_cli.config.checks import without_model
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import methods_of, planner_of
 from hjepa_cli.core.evaluation.protocol import Point
-from hjepa_cli.core.evaluation.simulator import Simulator, run_points
+from hjepa_cli.core.evaluation.simulator import Simulator, start_points
 from hjepa_cli.core.networks.model import Model, build_modules
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 from hjepa_cli.core.plants.named import Camera, plant
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.train_encoder import describe_architecture
 from hjepa_cli.storage import runs, zoo
 
@@ -55,8 +58,8 @@ def pieces(model: Model, devices: int) -> None:
     macs = multiply_accumulates(lambda: model.encode(frames[:1]))
     print(f"encoder   {macs / 1e6:12.1f} million MACs per embedding")
     z = torch.randn(devices, model.architecture["embedding"], device=model.device)
-    for name in (name for name in model.methods if name not in ("hold", "zero", *ANCHORS)):
-        planner = model.planner(name)
+    for name in (name for name in methods_of(model) if METHODS[name].planner):
+        planner = planner_of(model, name)
         with torch.inference_mode():
             took_ms = 1e3 * seconds(lambda planner=planner: planner.plan(z))
             macs = multiply_accumulates(lambda planner=planner: planner.plan(z[:1]))
@@ -80,12 +83,12 @@ def loops(model: Model, settings: Settings, devices: int, steps: int) -> None:
     print(
         f"real-time factor of {devices} devices together, {steps} steps of {kind.step_s * 1e3:g} ms"
     )
-    trained = (name for name in model.methods if name not in ANCHORS)
-    for name in (*trained, *(name for name in TRUE_STATE if name != "optimal")):
+    trained = (name for name in methods_of(model) if not METHODS[name].fitted)
+    for name in (*trained, *(name for name in without_model() if name != "optimal")):
         factors = []
         for gap in (1.0, 20.0, 80.0):
             started = time.perf_counter()
-            run_points(simulator, name, [Point("gap", gap)], devices, lambda steps: None)
+            start_points(simulator, name, [Point("gap", gap)], devices, lambda steps: None)()
             took_s = time.perf_counter() - started
             factors.append(f"{devices * steps * kind.step_s / took_s:9.1f} x at D = {gap:g}")
         print(f"{name:9} " + ", ".join(factors))

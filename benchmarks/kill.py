@@ -6,11 +6,12 @@
 Every stage runs in a child process of its own and is killed right before one of its calls that
 touch the disk, drawn among all of them. Between two such calls a kill finds the same disk at any
 time, so these are all the moments there are (but for those inside a single write, of which
-tests/storage/test_files.py takes care), and they do not depend on the machine's speed. After each kill,
-every file that is there under its own name must load; then the same command is given again, in the
-end ``hjepa resume``. Datasets, checkpoints, ``metrics.csv``, curves and tables must be the bytes of
-a run that was not killed, and no other file may be left. Prints kills, and how many came during a
-write. ``--every N`` kills before every Nth call instead, one kill a run; 1 leaves no moment out.
+tests/storage/test_files.py takes care), and they do not depend on the machine's speed. After each
+kill, every file that is there under its own name must load; then the same command is given again,
+in the end ``hjepa resume``. Datasets, checkpoints, ``metrics.csv``, curves and tables must be the
+bytes of a run that was not killed, and no other file may be left. Prints kills, and how many came
+during a write. ``--every N`` kills before every Nth call instead, one kill a run; 1 leaves no
+moment out.
 """
 
 import argparse
@@ -35,11 +36,11 @@ import torch
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets import dataset as datasets
 from hjepa_cli.core.datasets.dataset import load_dataset
+from hjepa_cli.core.training import progress
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import (
     collect,
     evaluate,
-    progress,
     resume,
     scale,
     train_encoder,
@@ -174,7 +175,7 @@ def check_files(directory: Path) -> int:
             load_checkpoint(path)
     for path in directory.glob("*.json") if directory.is_dir() else ():
         files.read_json(path)
-    return sum(files.is_temporary(name) for name in files.list_names(directory))
+    return sum(bool(files.TEMPORARY.fullmatch(name)) for name in files.list_names(directory))
 
 
 def kill_stage(

@@ -17,14 +17,15 @@ import numpy as np
 from scipy import stats
 
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.loop import Draws, every_step, simulate
-from hjepa_cli.core.control.methods import build_method
 from hjepa_cli.core.evaluation.cell_simulation import measure_growth, simulate_cell
 from hjepa_cli.core.evaluation.load_simulator import CALIBRATION_SEED
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.core.radio.schedulers import SCHEDULERS, drift_plus_penalty
+from hjepa_cli.core.radio.schedulers import drift_plus_penalty
 from hjepa_cli.core.radio.uplink import Access
+from hjepa_cli.plugins import SCHEDULERS
 from hjepa_cli.storage import zoo
 
 GIVEN_UP = 0.3
@@ -45,8 +46,8 @@ def main() -> None:
     if options.slots:
         protocol = dataclasses.replace(protocol, warmup_steps=0, steps=options.slots)
     model = Model.load(zoo.resolve_model(options.checkpoint)) if options.checkpoint else None
-    method = build_method(options.method, settings, model)
-    teacher = build_method("optimal", settings, None)
+    method = build_driver(options.method, settings, model)
+    teacher = build_driver("optimal", settings, None)
     growths = [
         measure_growth(kind, settings.protocol, seed + CALIBRATION_SEED, method)
         for seed in range(options.seeds)

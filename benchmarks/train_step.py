@@ -36,7 +36,8 @@ from torch.nn import functional as F
 from torch.utils.data import DataLoader, Dataset
 
 from hjepa_cli.compute.device import autocast
-from hjepa_cli.config.settings import Settings, load_settings
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks.encoder import STEM_PX, Encoder, normalise
 from hjepa_cli.core.networks.model import build_modules
@@ -44,8 +45,7 @@ from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.networks.symmetry import flatten_twins
 from hjepa_cli.core.plants.named import Camera
 from hjepa_cli.core.training.batches import FrameWindows
-from hjepa_cli.core.training.ema import EmaTarget
-from hjepa_cli.core.training.jepa import Jepa
+from hjepa_cli.core.training.jepa import EmaTarget, Jepa
 from hjepa_cli.core.training.losses import InverseDynamics, rollout_loss
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.stages.train_encoder import describe_architecture

@@ -20,6 +20,7 @@ _HOMES = {
     "load_model": "hjepa_cli.api",
     "load_settings": "hjepa_cli.config.settings",
     "predict": "hjepa_cli.api",
+    "register": "hjepa_cli.plugins",
     "scale": "hjepa_cli.api",
     "simulate_cell": "hjepa_cli.api",
     "teacher": "hjepa_cli.core.plants.named",
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from hjepa_cli.config.settings import load_settings
     from hjepa_cli.core.networks.model import Model
     from hjepa_cli.core.plants.named import Camera, CartPole, teacher
+    from hjepa_cli.plugins import register
 
 __all__ = [
     "Camera",
@@ -57,6 +59,7 @@ __all__ = [
     "load_model",
     "load_settings",
     "predict",
+    "register",
     "scale",
     "simulate_cell",
     "teacher",

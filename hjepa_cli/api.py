@@ -4,10 +4,9 @@ Errors are those of :mod:`hjepa_cli.errors`. Values of settings are given by the
 in a TOML file: ``settings={"protocol.steps": 200}``; ``hjepa config show`` lists them.
 """
 
-import dataclasses
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hjepa_cli.config.checks import check_count, check_schedulable
-from hjepa_cli.config.resolve import resolve
-from hjepa_cli.config.settings import Settings
+from hjepa_cli.config.checks import check_count, check_schedulable, check_uplink, resolve
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.drivers import build_driver, planner_of
 from hjepa_cli.core.control.loop import Draws, delivery_schedule, gap_schedule, simulate
-from hjepa_cli.core.control.methods import build_method
 from hjepa_cli.core.datasets import dataset as datasets
 from hjepa_cli.core.evaluation import cell_simulation as cell_loop
 from hjepa_cli.core.evaluation.load_simulator import CALIBRATION_SEED
@@ -29,24 +27,20 @@ from hjepa_cli.core.plants.conditions import actual_plant
 from hjepa_cli.core.radio.uplink import Access
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.plugins import STAGES
 from hjepa_cli.storage import zoo
 
 Values = Mapping[str, Any]
 
 
 def load_model(name_or_path: str | Path, *, device: str = "cpu") -> Model:
-    """Load a trained model, verified.
+    """Load a trained model, verified; it has ``encode(frames)``, ``actor(z)``, ``planner(method)``.
 
     Args:
         name_or_path: a name of the zoo (``hjepa models list``), a run directory, or a file.
         device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
 
-    Returns:
-        A model with ``encode(frames)``, ``actor(z)`` and ``planner(method)``.
-
-    Raises:
-        MissingInputError: no such model.
-        DataError: damaged, or an encoder without its hierarchy.
+    Raise MissingInputError without one, and DataError for a damaged one, or for an encoder alone.
     """
     return Model.load(zoo.resolve_model(name_or_path), device)
 
@@ -54,16 +48,14 @@ def load_model(name_or_path: str | Path, *, device: str = "cpu") -> Model:
 def load_dataset(path: str | Path) -> datasets.Dataset:
     """Open a dataset directory; ``.split("train")`` reads its trajectories, verified.
 
-    Raises:
-        MissingInputError: no such directory.
-        DataError: not an intact dataset.
+    Raise MissingInputError without one, and DataError where it is not intact.
     """
     return datasets.load_dataset(Path(path))
 
 
 @torch.inference_mode()
 def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tuple[Tensor, Tensor]:
-    """What a controller does when packets stop coming: forces and the embedding it ends at.
+    """Return what a controller does when packets stop coming, and the embedding it ends at.
 
     Args:
         model: of :func:`load_model`.
@@ -79,7 +71,7 @@ def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tu
         UsageError: no such predictor, or no step.
     """
     check_count("steps", steps)
-    planner = model.planner(method)
+    planner = planner_of(model, method)
     z = z.to(model.device)
     forces_n = []
     for _ in range(-(-steps // planner.stride)):
@@ -126,14 +118,8 @@ def drive(
         schedule = delivery_schedule(delivery, draws.delivery)
     else:
         schedule = gap_schedule(1 if gap_steps is None else gap_steps, draws.steps, devices)
-    how = build_method(method, chosen, model)
-    states: list[Floats] = []
-    forces: list[Floats] = []
-
-    def watch(k: int, now: Floats, forces_n: Floats) -> None:
-        states.append(now.copy())
-        forces.append(forces_n.copy())
-
+    how = build_driver(method, chosen, model)
+    seen: list[tuple[Floats, Floats]] = []
     outcome = simulate(
         actual_plant(chosen),
         draws,
@@ -141,14 +127,11 @@ def drive(
         how.controller(devices),
         how.sensor,
         delay_steps=how.delay_steps,
-        watch=watch,
+        watch=lambda k, now, forces_n: seen.append((now.copy(), forces_n.copy())),
     )
-    return {
-        "states": np.stack(states),
-        "forces_n": np.stack(forces),
-        "score": outcome.score[0],
-        "cost": outcome.cost[0],
-    }
+    states, forces_n = map(np.stack, zip(*seen, strict=True))
+    score, cost = outcome.score[0], outcome.cost[0]
+    return {"states": states, "forces_n": forces_n, "score": score, "cost": cost}
 
 
 def simulate_cell(
@@ -170,7 +153,8 @@ def simulate_cell(
         scheduler: who gets them.
         model: of :func:`load_model`, of the same plant.
         preset, settings: plant, seed and protocol; of ``radio``, the power margin,
-            how long fades last and the share of transmissions that fail, none of which is repeated.
+            how long fades last and the share of transmissions that fail, none of which is repeated;
+            nothing else of it may be set.
 
     Returns:
         ``score`` [N] (share of steps inside the band), ``cost`` [N] (mean capped quadratic cost),
@@ -179,7 +163,7 @@ def simulate_cell(
 
     Raises:
         UsageError: unknown method or scheduler, a method without packets of a slot, more blocks
-            than devices, or fewer than two steps.
+            than devices, fewer than two steps, or a setting of ``radio`` that is not read here.
         DataError: ``model`` is of another plant.
     """
     check_count("devices", devices)
@@ -187,7 +171,8 @@ def simulate_cell(
     chosen = _settings(preset, None, settings)
     check_schedulable([method], chosen.protocol.total_steps)
     kind, protocol, radio = actual_plant(chosen), chosen.protocol, chosen.radio
-    how = build_method(method, chosen, model)
+    check_uplink(radio)
+    how = build_driver(method, chosen, model)
     access = Access(
         scheduler=scheduler,
         blocks=blocks,
@@ -199,8 +184,7 @@ def simulate_cell(
         seed=chosen.seed,
     )
     outcome = cell_loop.simulate_cell(kind, protocol, chosen.seed, devices, access, how)
-    named = dataclasses.asdict(outcome)
-    return {key: named[key] for key in ("score", "cost", "packets", "reports")}
+    return {key: getattr(outcome, key) for key in ("score", "cost", "packets", "reports")}
 
 
 def collect(
@@ -210,10 +194,8 @@ def collect(
     config: str | Path | None = None,
     settings: Values | None = None,
 ) -> datasets.Dataset:
-    """Simulate trajectories and store them, as ``hjepa collect``; returns the dataset."""
-    from hjepa_cli.stages.collect import run
-
-    made = run(_settings(preset, config, settings), _silent(), out=_path(out))
+    """Simulate trajectories and store them, as ``hjepa collect``; return the dataset."""
+    made = _call("collect", preset, config, settings, out=out)
     return load_dataset(made["dataset"])
 
 
@@ -225,12 +207,8 @@ def train_encoder(
     config: str | Path | None = None,
     settings: Values | None = None,
 ) -> dict[str, Any]:
-    """Learn an encoder, as ``hjepa train-encoder``; returns the document of ``--json``."""
-    from hjepa_cli.stages.train_encoder import run
-
-    return run(
-        _settings(preset, config, settings), _silent(), dataset=_path(dataset), out=_path(out)
-    )
+    """Learn an encoder, as ``hjepa train-encoder``; return the document of ``--json``."""
+    return _call("train-encoder", preset, config, settings, out=out, dataset=_path(dataset))
 
 
 def train_hierarchy(
@@ -242,16 +220,9 @@ def train_hierarchy(
     config: str | Path | None = None,
     settings: Values | None = None,
 ) -> dict[str, Any]:
-    """Train predictors and actor, as ``hjepa train-hierarchy``; returns the ``--json`` document."""
-    from hjepa_cli.stages.train_hierarchy import run
-
-    return run(
-        _settings(preset, config, settings),
-        _silent(),
-        dataset=_path(dataset),
-        encoder=None if encoder is None else str(encoder),
-        out=_path(out),
-    )
+    """Train predictors and actor, as ``hjepa train-hierarchy``; return the ``--json`` document."""
+    inputs = {"dataset": _path(dataset), "encoder": encoder}
+    return _call("train-hierarchy", preset, config, settings, out=out, **inputs)
 
 
 def train_reflex(
@@ -263,16 +234,9 @@ def train_reflex(
     config: str | Path | None = None,
     settings: Values | None = None,
 ) -> dict[str, Any]:
-    """Train rivals that predict nothing, as ``hjepa train-reflex``; returns the document."""
-    from hjepa_cli.stages.train_reflex import run
-
-    return run(
-        _settings(preset, config, settings),
-        _silent(),
-        dataset=_path(dataset),
-        checkpoint=None if checkpoint is None else str(checkpoint),
-        out=_path(out),
-    )
+    """Train rivals that predict nothing, as ``hjepa train-reflex``; return the document."""
+    inputs = {"dataset": _path(dataset), "checkpoint": checkpoint}
+    return _call("train-reflex", preset, config, settings, out=out, **inputs)
 
 
 def evaluate(
@@ -285,10 +249,10 @@ def evaluate(
     config: str | Path | None = None,
     settings: Values | None = None,
 ) -> dict[str, Any]:
-    """Measure methods in closed loop, as ``hjepa eval``; returns the document of ``--json``."""
-    from hjepa_cli.stages.evaluate import run
-
-    return _measure(run, checkpoint, methods, out, remeasure, preset, config, settings)
+    """Measure methods in closed loop, as ``hjepa eval``; return the document of ``--json``."""
+    values = _with(settings, methods=methods)
+    inputs = {"checkpoint": checkpoint, "remeasure": remeasure}
+    return _call("eval", preset, config, values, out=out, **inputs)
 
 
 def scale(
@@ -303,34 +267,30 @@ def scale(
     config: str | Path | None = None,
     settings: Values | None = None,
 ) -> dict[str, Any]:
-    """Count the devices of a cell, as ``hjepa scale``; returns the document of ``--json``."""
-    from hjepa_cli.stages.scale import run
-
-    radio = {"radio.snr_db": snr, "radio.law": law}
-    values = dict(settings or {}) | {key: value for key, value in radio.items() if value}
-    return _measure(run, checkpoint, methods, out, remeasure, preset, config, values)
+    """Count the devices of a cell, as ``hjepa scale``; return the document of ``--json``."""
+    values = _with(settings, **{"methods": methods, "radio.snr_db": snr, "radio.law": law})
+    inputs = {"checkpoint": checkpoint, "remeasure": remeasure}
+    return _call("scale", preset, config, values, out=out, **inputs)
 
 
-def _measure(
-    run: Callable[..., dict[str, Any]],
-    checkpoint: str | Path | None,
-    methods: Sequence[str] | None,
-    out: str | Path | None,
-    remeasure: bool,
+def _call(
+    stage: str,
     preset: str | None,
     config: str | Path | None,
-    settings: Values | None,
+    values: Values | None,
+    *,
+    out: str | Path | None,
+    **inputs: Any,
 ) -> dict[str, Any]:
-    values = dict(settings or {})
-    if methods is not None:
-        values["methods"] = list(methods)
-    return run(
-        _settings(preset, config, values),
-        _silent(),
-        checkpoint=None if checkpoint is None else str(checkpoint),
-        out=_path(out),
-        remeasure=remeasure,
-    )
+    """Run a stage without notes, progress or tables: its result is returned."""
+    silent = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+    settings = _settings(preset, config, values)
+    return STAGES[stage].run(settings, silent, out=_path(out), **inputs)
+
+
+def _with(values: Values | None, **given: Any) -> Values:
+    """Return values with those that were given as arguments."""
+    return {**(values or {}), **{key: value for key, value in given.items() if value is not None}}
 
 
 def _settings(preset: str | None, config: str | Path | None, values: Values | None) -> Settings:
@@ -339,8 +299,3 @@ def _settings(preset: str | None, config: str | Path | None, values: Values | No
 
 def _path(path: str | Path | None) -> Path | None:
     return None if path is None else Path(path)
-
-
-def _silent() -> Screen:
-    """No notes, no progress, no tables: results are returned."""
-    return Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())

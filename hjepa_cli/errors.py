@@ -4,21 +4,17 @@ An :class:`HjepaError` is printed as one line (what was wrong, where, the valid 
 optional hint (the command to run next); it never shows a traceback. Codes follow sysexits.h.
 """
 
+from importlib.util import find_spec
+
 
 class HjepaError(Exception):
-    """Base of all expected errors.
-
-    Args:
-        message: one line: what was wrong, where, and the valid choices.
-        hint: what to run or change next.
-    """
+    """Base of all expected errors; the hint says what to run or change next."""
 
     exit_code = 1
 
     def __init__(self, message: str, *, hint: str | None = None) -> None:
         super().__init__(message)
-        self.message = message
-        self.hint = hint
+        self.message, self.hint = message, hint
 
 
 class UsageError(HjepaError):
@@ -37,6 +33,14 @@ class MissingInputError(HjepaError):
     """A dataset, checkpoint or model is not there."""
 
     exit_code = 66
+
+
+def require(module: str, what: str, extra: str, instead: str = "") -> None:
+    """Raise MissingInputError for what needs a package of an extra that is not installed."""
+    if find_spec(module) is None:
+        raise MissingInputError(
+            f"{what}, which is not installed", hint=f'pip install "hjepa[{extra}]"{instead}'
+        )
 
 
 class NumericalError(HjepaError):
@@ -63,15 +67,12 @@ class LockedError(HjepaError):
     exit_code = 75
 
 
+class Unsealed(UserWarning):
+    """A file of an older version has no seal: nobody can tell whether it was changed."""
+
+
 class Interrupted(HjepaError):
-    """Ctrl-C or SIGTERM; nothing is lost.
-
-    Args:
-        message, hint: as for :class:`HjepaError`.
-        code: 128 + the signal's number.
-    """
-
-    exit_code = 130
+    """Ctrl-C or SIGTERM, whose code is 128 + the signal's number; nothing is lost."""
 
     def __init__(self, message: str, *, hint: str | None = None, code: int = 130) -> None:
         super().__init__(message, hint=hint)

@@ -37,8 +37,8 @@ LOSSES = 0x1055  # this stream's branch of the seed tree
 class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """One cart-pole; the observation is its state (x, x_dot, theta, theta_dot) in SI units.
 
-    The action [1] in -1 … 1 is the force ÷ 20 N. ``info`` has ``state`` and ``score``, the share
-    of control steps of this action inside the band |x| ≤ 0.05 m, |theta| ≤ 0.05 rad.
+    The action [1] in -1 … 1 is the force ÷ its limit, 20 N. ``info`` has ``state`` and ``score``,
+    the share of control steps of this action inside the band |x| ≤ 0.05 m, |theta| ≤ 0.05 rad.
 
     Args:
         plant: ``"desktop"`` (1 ms control steps, 1,000 of them) or ``"gym"`` (20 ms, 300).
@@ -68,32 +68,28 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         check_count("action_repeat", action_repeat)
         self._pole = CartPole(plant)
         self._kind = self._pole.plant
-        self._protocol = load_settings(
-            "gym" if plant == "gym" else None,
-            flags={"protocol": "paper"},  # episodes have a start
-        ).protocol
+        preset = "gym" if plant == "gym" else None
+        # Episodes have a start.
+        self._protocol = load_settings(preset, flags={"protocol": "paper"}).protocol
         self._camera = Camera(self._kind)
         self._reward, self._repeat = reward, action_repeat
         self._noise = noise_per_step(self._protocol) * noise
         self._k = 0
         self.render_mode = render_mode
-        self.metadata = type(self).metadata | {
-            "render_fps": max(round(1 / (self._kind.step_s * action_repeat)), 1)
-        }
+        render_fps = max(round(1 / (self._kind.step_s * action_repeat)), 1)
+        self.metadata = type(self).metadata | {"render_fps": render_fps}
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        self.observation_space: spaces.Space[Any] = spaces.Box(
-            -STATE_LIMIT, STATE_LIMIT, (4,), np.float32
-        )
+        states = spaces.Box(-STATE_LIMIT, STATE_LIMIT, (4,), np.float32)
+        self.observation_space: spaces.Space[Any] = states
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start as the closed loop does: anywhere in its range, then one step without a force."""
         super().reset(seed=seed)
-        protocol = self._protocol
-        half_widths = np.array(protocol.half_widths)
         # A new simulation: what pymunk remembers of the last episode would move the last bits.
         self._pole = CartPole(self._kind)
+        half_widths = np.array(self._protocol.half_widths)
         self._pole.state = self.np_random.uniform(-1, 1, 4) * half_widths
         self._pole.step(0.0)  # from k = -1 to 0, which nobody scores
         self._k = 0
@@ -102,11 +98,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Apply a force, ``action_repeat`` control steps long.
-
-        Raises:
-            NumericalError: the action is not finite.
-        """
+        """Apply a force for ``action_repeat`` control steps; raise NumericalError if not finite."""
         kind, limit_n = self._kind, self._kind.force_limit_n
         share = float(np.asarray(action, float).reshape(-1)[0])
         if not math.isfinite(share):
@@ -129,7 +121,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observe(), reward, bool(fallen), bool(over), self._info(score / steps)
 
     def render(self) -> Any:
-        """The camera's frame uint8 [64, 128, 3], in render mode ``rgb_array``."""
+        """Return the camera's frame uint8 [64, 128, 3], in render mode ``rgb_array``."""
         return self._frame() if self.render_mode == "rgb_array" else None
 
     def _observe(self) -> Observation:
@@ -172,17 +164,13 @@ class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any]):
         env: any environment.
         delivery_probability: p, of each observation, independently. For a Rayleigh-fading link,
             1 - ``hjepa_cli.core.radio.channel.outage_probability(rate_bps, bandwidth_hz, snr_db)``.
-
-    Raises:
-        UsageError: p outside 0 … 1.
+            Raise UsageError outside 0 … 1.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], delivery_probability: float) -> None:
         super().__init__(env)
         if not 0 <= delivery_probability <= 1:
-            raise UsageError(
-                f"delivery_probability = {delivery_probability}; expected between 0 and 1"
-            )
+            raise UsageError(f"delivery_probability = {delivery_probability}; expected 0 to 1")
         self.delivery_probability = delivery_probability
         self._received: Any = None
         self._age = 0

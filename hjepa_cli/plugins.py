@@ -1,8 +1,11 @@
-"""Extensions by name: the package's own, those of installed packages, and files that the user names.
+"""Extensions by name: the package's own, those of installed packages, and of files of the user.
 
 Six kinds of things can be added without a change to the package: plants, codecs, schedulers,
-methods, sharing laws and stages. Each is one object that says what it extends and what it is
-called. The package's own are listed in :data:`BUILT_IN` and imported when one is asked for; others
+methods, sharing laws and stages. Each is one object, made with a class of the package, and has a
+name. Codecs and methods may be families, whose ``member(name)`` makes the extension of a name, as
+``pca-8x6``, or returns ``None`` for the names of others.
+
+The package's own are listed in :data:`BUILT_IN` and imported when one is asked for; others
 come from an entry point of the group ``hjepa.plugins``, a module that calls :func:`register`, or
 from a file that the user names (``--plugin FILE.py``). Nothing else ever causes an import: what a
 dataset, a checkpoint or a run says is data.
@@ -24,12 +27,72 @@ from hjepa_cli.errors import MissingInputError, UsageError
 
 GROUP = "hjepa.plugins"
 
+_CONTROL = "hjepa_cli.core.control"
 BUILT_IN: dict[str, dict[str, str]] = {
     "plant": {
         "desktop": "hjepa_cli.core.plants.cartpole.plant:DESKTOP",
         "gym": "hjepa_cli.core.plants.cartpole.plant:GYM",
         "quadrotor": "hjepa_cli.core.plants.quadrotor:QUADROTOR",
     },
+    "scheduler": {
+        "round-robin": "hjepa_cli.core.radio.schedulers.round_robin:ROUND_ROBIN",
+        "opportunistic": "hjepa_cli.core.radio.schedulers.opportunistic:OPPORTUNISTIC",
+        "max-aoi": "hjepa_cli.core.radio.schedulers.max_aoi:MAX_AOI",
+        "drift-plus-penalty": "hjepa_cli.core.radio.schedulers.drift_plus_penalty:LYAPUNOV",
+        "whittle": "hjepa_cli.core.radio.schedulers.whittle:WHITTLE",
+        "innovation": "hjepa_cli.core.radio.schedulers.innovation:INNOVATION",
+    },
+    "law": {
+        "duty": "hjepa_cli.core.radio.laws.duty:DUTY",
+        "equal": "hjepa_cli.core.radio.laws.equal:EQUAL",
+        "scheduled": "hjepa_cli.core.radio.laws.scheduled:SCHEDULED",
+    },
+    "stage": {
+        "collect": "hjepa_cli.stages.pipeline:COLLECT",
+        "train-encoder": "hjepa_cli.stages.pipeline:TRAIN_ENCODER",
+        "train-hierarchy": "hjepa_cli.stages.pipeline:TRAIN_HIERARCHY",
+        "train-reflex": "hjepa_cli.stages.pipeline:TRAIN_REFLEX",
+        "eval": "hjepa_cli.stages.pipeline:EVAL",
+        "scale": "hjepa_cli.stages.pipeline:SCALE",
+        "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
+    },
+    "codec": {
+        "float32": f"{_CONTROL}.codecs.float:FLOAT32",
+        "float16": f"{_CONTROL}.codecs.float:FLOAT16",
+        "int2 … int16": f"{_CONTROL}.codecs.integers:INTEGERS",
+        "pca-NxB": f"{_CONTROL}.codecs.principal_components:PRINCIPAL_COMPONENTS",
+    },
+    "method": {
+        "hjepa": f"{_CONTROL}.methods.predictors:HJEPA",
+        **{f"ts-jepa-{h}": f"{_CONTROL}.methods.predictors:TS_JEPA" for h in range(1, 6)},
+        "supervised-2": f"{_CONTROL}.methods.raw_frames:SUPERVISED_2",
+        "supervised-4": f"{_CONTROL}.methods.raw_frames:SUPERVISED_4",
+        "autoencoder-2": f"{_CONTROL}.methods.raw_frames:AUTOENCODER_2",
+        "hold": f"{_CONTROL}.methods.last_force:HOLD",
+        "zero": f"{_CONTROL}.methods.last_force:ZERO",
+        "hold-decay": f"{_CONTROL}.methods.reflexes:HOLD_DECAY",
+        "hold-decay-linear": f"{_CONTROL}.methods.reflexes:HOLD_DECAY_LINEAR",
+        "chunk": f"{_CONTROL}.methods.reflexes:CHUNK",
+        "chunk-forces": f"{_CONTROL}.methods.reflexes:CHUNK_FORCES",
+        "hold-true": f"{_CONTROL}.methods.true_state:HOLD_TRUE",
+        "zero-true": f"{_CONTROL}.methods.true_state:ZERO_TRUE",
+        "optimal": f"{_CONTROL}.methods.true_state:OPTIMAL",
+        "oracle": f"{_CONTROL}.methods.true_state:ORACLE",
+        "linear": f"{_CONTROL}.methods.predictors:LINEAR",
+        "state-kf": f"{_CONTROL}.methods.filtered_state:STATE_KF",
+        "state-48": f"{_CONTROL}.methods.filtered_state:STATE_48",
+        "local": f"{_CONTROL}.methods.last_force:LOCAL",
+    },
+}
+
+
+CLASSES = {  # what extensions are made with, those with families too
+    "plant": ("hjepa_cli.core.plants.system:System",),
+    "codec": (f"{_CONTROL}.codecs.codec:Codec", f"{_CONTROL}.codecs.codec:CodecFamily"),
+    "scheduler": ("hjepa_cli.core.radio.schedulers.scheduler:Scheduler",),
+    "method": (f"{_CONTROL}.methods.method:Method", f"{_CONTROL}.methods.method:MethodFamily"),
+    "law": ("hjepa_cli.core.radio.laws.law:SharingLaw",),
+    "stage": ("hjepa_cli.stages.stage:Stage",),
 }
 
 
@@ -38,7 +101,7 @@ class Source:
     """Where extensions came from.
 
     Attributes:
-        name: the path of a file as the user named it, or an installed distribution with its version.
+        name: the path of a file as the user named it, or an installed package with its version.
         sha256: of the file's bytes, or of the name.
         text: the file's code, which other processes run again; ``None`` of an installed one.
     """
@@ -47,13 +110,14 @@ class Source:
     sha256: str
     text: str | None = dataclasses.field(default=None, repr=False)
 
+    @property
+    def installed(self) -> bool:
+        """Return whether it is an installed distribution, and no file."""
+        return self.sha256 == _digest(self.name)
+
 
 class Registry:
-    """Extensions of one kind.
-
-    Args:
-        kind: ``"plant"``, ``"codec"`` …, as in messages.
-    """
+    """Extensions of one ``kind``: ``"plant"``, ``"codec"`` …, as in messages."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -61,43 +125,71 @@ class Registry:
         self._added: dict[str, tuple[Any, Source | None]] = {}
 
     def __iter__(self) -> Iterator[str]:
-        """Names, the package's own first."""
+        """Return the names, the package's own first."""
         load_installed()
         return iter([*self._own, *self._added])
 
-    def __contains__(self, name: object) -> bool:
-        return name in self._own or name in list(self)
+    def __contains__(self, name: str) -> bool:
+        return self._place(name) is not None
 
     def __getitem__(self, name: str) -> Any:
-        """The extension called ``name``.
+        """Return the extension called ``name``, which its family makes where it has one.
 
-        Raises:
-            UsageError: there is none, naming those that there are.
+        Raise UsageError, naming those that there are, where there is none.
         """
-        if name in self._own:
-            module, _, attribute = self._own[name].partition(":")
-            return getattr(importlib.import_module(module), attribute)
-        if name not in self:
+        place = self._place(name)
+        if place is None:
             raise UsageError(f"unknown {self.kind} '{name}'; choose from {', '.join(self)}")
-        return self._added[name][0]
+        item = self._load(place)
+        return item.member(name) if _is_family(item) else item
+
+    def values(self) -> list[Any]:
+        """Return the extensions themselves, each once; of a family the family."""
+        return list({id(item): item for item in map(self._load, self)}.values())
 
     def source(self, name: str) -> Source | None:
-        """Where an extension came from; ``None`` for the package's own, and for unknown names."""
-        return self._added[name][1] if name in self._added else None
+        """Return where an extension came from; ``None`` for the package's own and unknown ones."""
+        place = self._place(name)
+        return self._added[place][1] if place in self._added else None
 
     def add(self, item: Any, source: Source | None) -> None:
         """Take up an extension under its ``name``. Raises UsageError where that is taken."""
         name = getattr(item, "name", None)
         if not isinstance(name, str) or not name:
             raise UsageError(f"a {self.kind} without a name: {item!r}")
-        if name in self._own or name in self._added:
+        if name in [*self._own, *self._added] or name in self:
             raise UsageError(f"there is a {self.kind} called '{name}' already; choose another name")
         self._added[name] = item, source
 
+    def _place(self, name: str) -> str | None:
+        """Return the name that ``name`` is registered under, its own or its family's."""
+        exact = [name] if name in self._own or name in list(self) else []
+        if self.kind not in WITH_FAMILIES:
+            return next(iter(exact), None)
+        return next((place for place in exact or list(self) if self._makes(place, name)), None)
 
-KINDS = ("plant", "codec", "scheduler", "method", "law", "stage")
-PLANTS, CODECS, SCHEDULERS, METHODS, LAWS, STAGES = (Registry(kind) for kind in KINDS)
-_REGISTRIES = {one.kind: one for one in (PLANTS, CODECS, SCHEDULERS, METHODS, LAWS, STAGES)}
+    def _makes(self, place: str, name: str) -> bool:
+        item = self._load(place)
+        return item.member(name) is not None if _is_family(item) else place == name
+
+    def _load(self, place: str) -> Any:
+        if place not in self._own:
+            return self._added[place][0]
+        return _imported(self._own[place])
+
+
+def _imported(place: str) -> Any:
+    module, _, attribute = place.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _is_family(item: Any) -> bool:
+    return hasattr(item, "member")
+
+
+WITH_FAMILIES = tuple(kind for kind, places in CLASSES.items() if len(places) > 1)
+_REGISTRIES = {kind: Registry(kind) for kind in CLASSES}
+PLANTS, CODECS, SCHEDULERS, METHODS, LAWS, STAGES = _REGISTRIES.values()
 
 _sources: list[Source] = []
 _loading: contextvars.ContextVar[Source | None] = contextvars.ContextVar("loading", default=None)
@@ -105,28 +197,27 @@ _looked = False
 
 
 def register(*items: Any) -> None:
-    """Add extensions: a plant, codec, scheduler, method, sharing law or stage each.
+    """Add extensions, each made with a class of :data:`CLASSES`, which says of which kind it is.
 
-    Each says by its attribute ``extends`` which of them it is, as the classes of the package do
-    that it is made with, and has a ``name``.
-
-    Raises:
-        UsageError: it says nothing of the kind, has no name, or one that is taken.
+    Raise UsageError where it is not, or where its name is taken.
     """
     for item in items:
-        kind = getattr(item, "extends", None)
-        if kind not in _REGISTRIES:
-            raise UsageError(f"{item!r} extends nothing; it must be a {' or '.join(KINDS)}")
-        _REGISTRIES[kind].add(item, _loading.get())
+        for kind, places in CLASSES.items():
+            if isinstance(item, tuple(map(_imported, places))):
+                _REGISTRIES[kind].add(item, _loading.get())
+                break
+        else:
+            made_with = (place.partition(":")[2] for places in CLASSES.values() for place in places)
+            raise UsageError(f"{item!r} extends nothing; make it with {', '.join(made_with)}")
 
 
 def load_file(path: Path) -> Source:
-    """Run a file that registers extensions; a second time only if it has changed its place or text.
+    """Run a file that registers extensions; again only if its text has changed, in place of before.
 
     Raises:
         MissingInputError: there is no such file.
-        UsageError: it cannot be read, does not run, or registers what cannot be; in one line with
-            the file and the line. Nothing of it stays registered then.
+        UsageError: it cannot be read, does not run, or registers what cannot be; it names the line,
+            and nothing of the file stays registered.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -134,17 +225,13 @@ def load_file(path: Path) -> Source:
         raise MissingInputError(f"plugin {path} does not exist") from None
     except (OSError, ValueError) as error:
         raise UsageError(f"plugin {path} cannot be read: {error}") from None
-    source = Source(str(path), hashlib.sha256(text.encode()).hexdigest(), text)
+    source = Source(str(path), _digest(text), text)
     ensure([source])
     return source
 
 
 def ensure(sources: Iterable[Source]) -> None:
-    """Load the files that another process has loaded, from the text that it read.
-
-    Raises:
-        UsageError: as :func:`load_file`.
-    """
+    """Load files as :func:`load_file`, from the text that another process has read."""
     load_installed()
     for source in sources:
         if source.text is not None and source.sha256 not in {one.sha256 for one in _sources}:
@@ -160,8 +247,7 @@ def in_force() -> tuple[Source, ...]:
 def load_installed() -> None:
     """Import the entry points of :data:`GROUP` of all installed packages, once.
 
-    Raises:
-        UsageError: one does not import, or registers what cannot be, naming its package.
+    Raise UsageError, naming the package, where one does not import or registers what cannot be.
     """
     global _looked
     if _looked:
@@ -169,9 +255,13 @@ def load_installed() -> None:
     _looked = True
     for point in importlib.metadata.entry_points(group=GROUP):
         name = f"{point.dist.name} {point.dist.version}" if point.dist else point.value
-        source = Source(name, hashlib.sha256(name.encode()).hexdigest())
+        source = Source(name, _digest(name))
         with _transaction(source, name, hint=f"pip uninstall {name.split()[0]}"):
             point.load()
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _run(source: Source, text: str) -> None:
@@ -180,6 +270,11 @@ def _run(source: Source, text: str) -> None:
     module = types.ModuleType(name, f"The plugin {source.name}.")
     module.__file__ = source.name
     with _transaction(source, source.name):
+        for registry in _REGISTRIES.values():  # what an earlier text of this file registered
+            kept = registry._added.items()
+            registry._added = {
+                key: (item, of) for key, (item, of) in kept if not of or of.name != source.name
+            }
         sys.modules[name] = module  # dataclasses and pickle look there
         try:
             exec(compile(text, source.name, "exec"), module.__dict__)
@@ -198,21 +293,19 @@ def _transaction(source: Source, file: str, hint: str | None = None) -> Iterator
     except Exception as error:
         for kind, added in before.items():
             _REGISTRIES[kind]._added = added
-        reason = error.message if isinstance(error, UsageError) else _reason(error)
+        name, lines = type(error).__name__, str(error).splitlines()
+        reason = f"{name}: {lines[0]}" if lines and lines[0] else name
+        if isinstance(error, UsageError):
+            reason = error.message
         raise UsageError(f"plugin {_place(error, file)}: {reason}", hint=hint) from None
     else:
-        _sources.append(source)
+        _sources[:] = [one for one in _sources if one.name != source.name] + [source]
     finally:
         _loading.reset(token)
 
 
-def _reason(error: Exception) -> str:
-    first = next(iter(str(error).splitlines()), "")
-    return f"{type(error).__name__}: {first}" if first else type(error).__name__
-
-
 def _place(error: Exception, file: str) -> str:
-    """``FILE:LINE`` of the plugin where an error came from."""
+    """Return ``FILE:LINE`` of the plugin where an error came from."""
     line = error.lineno if isinstance(error, SyntaxError) and error.filename == file else None
     trace = error.__traceback__
     while trace is not None:

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,13 @@ def open_shell(
     monkeypatch.delenv("HJEPA_DEBUG", raising=False)
     monkeypatch.setenv("COLUMNS", "80")
     return Shell(directory, capture)
+
+
+def block(page: str, word: str) -> str:
+    """The first block of Python of a page of the documentation that has a word in it."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    return next(code for code in blocks if word in code)
 
 
 def assert_one_line_error(outcome: Outcome, code: int, *fragments: str) -> None:

@@ -1,21 +1,20 @@
-"""What every command does around its work: settings, plan or result, and errors of its own.
+"""What every command does around its stage: plugins, settings, plan or result, interruptions.
 
-Imports nothing heavy; see :mod:`hjepa_cli.cli.app`.
+Imports nothing heavy; see :mod:`hjepa_cli.cli.commands`.
 """
 
-from collections.abc import Callable, Iterator
+import inspect
+import warnings
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
-import typer
-
+from hjepa_cli.cli.commands import Command, Given
 from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code, sigterm_raises
-from hjepa_cli.errors import HjepaError, Interrupted, StorageError
+from hjepa_cli.config.checks import resolve
+from hjepa_cli.config.schema import declared
+from hjepa_cli.errors import HjepaError, Interrupted, StorageError, Unsealed
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import plan
-
-Result = dict[str, Any]
 
 
 class PipeClosed(HjepaError):
@@ -24,50 +23,54 @@ class PipeClosed(HjepaError):
     exit_code = StorageError.exit_code
 
 
-def execute(
-    screen: Screen,
-    stage: Callable[[], Result],
-    planned: Callable[[], plan.Plan] | None = None,
-    *,
-    dry_run: bool = False,
-    product: str | None = None,
-    workers: int | None = None,
-    cluster: str | None = None,
-    shared: bool = False,
-) -> None:
-    """Run a stage, or show its plan, and print what it returns.
-
-    Args:
-        stage: the work.
-        planned: its plan.
-        dry_run: show the plan only.
-        product: key of the result that a quiet run prints: the path that it made.
-        workers, cluster: where its parallel work goes, as the user said.
-        shared: several processes of torchrun may do it together.
-    """
-    with guard():
-        if not shared:
+def execute(command: Command, given: Given) -> None:
+    """Run a command's stage, or show its plan, and print what it returns."""
+    screen = Screen(given.pop("quiet"), given.pop("json"))
+    with _guard(screen):
+        del given["plugin"]  # loaded before the commands were listed
+        dry_run, _ = given.pop("dry_run", False), given.pop("debug")
+        workers, cluster = given.pop("workers", None), given.pop("cluster", None)
+        if command.prepare is not None:
+            command.prepare(given)
+        inputs = {"screen": screen, **(_settings(command, given) if command.resolves else given)}
+        if not command.shared:
             torchrun.refuse()
-        if dry_run and planned is not None:
-            planned().show(screen)
+        if dry_run and command.plan is not None:
+            plan = getattr(command.plan, "function", command.plan)
+            wanted = inspect.signature(plan).parameters.keys() & inputs.keys()
+            plan(**{name: inputs[name] for name in wanted}).show(screen)
             return
         from hjepa_cli.compute.executors import placed
 
         with placed(workers, cluster):
-            result = stage()
+            result = command.run(**inputs)
         if torchrun.follows():
             return
         if screen.json:
             screen.emit(result)
-        elif screen.quiet and product is not None:  # otherwise the stage has said where it is
-            screen.result(str(result[product]))
+        elif screen.quiet and command.product and (made := result[command.product]) is not None:
+            screen.result(str(made))  # otherwise the stage has said where it is
+
+
+def _settings(command: Command, given: Given) -> Given:
+    """Return what was given with the settings in place of what they are made of."""
+    preset, config = given["preset"], given["config"]
+    flags = {key: given[key] for key in given if key in declared() or key == "protocol"}
+    del flags["preset"]
+    settings = resolve(preset, config, flags)
+    if command.check is not None:
+        command.check(settings, given)
+    others = {name: given[name] for name in given if name not in (*flags, "preset", "config")}
+    return {"settings": settings, **others}
 
 
 @contextmanager
-def guard() -> Iterator[None]:
-    """Catch what Typer would turn into exit codes of its own."""
+def _guard(screen: Screen) -> Iterator[None]:
+    """Catch what Typer would turn into exit codes of its own, and say warnings in our words."""
     try:
-        with sigterm_raises():
+        with sigterm_raises(), warnings.catch_warnings():
+            warnings.simplefilter("default", Unsealed)
+            warnings.showwarning = lambda message, *_, **__: screen.say(f"warning: {message}")
             yield
     except KeyboardInterrupt as error:
         raise Interrupted(
@@ -75,10 +78,3 @@ def guard() -> Iterator[None]:
         ) from None
     except BrokenPipeError:
         raise PipeClosed("output closed") from None
-
-
-def print_help(context: typer.Context) -> None:
-    """A command group on its own shows its help."""
-    if context.invoked_subcommand is None:
-        print(context.get_help())
-        raise typer.Exit()

@@ -6,7 +6,7 @@ may be computed twice after a failure.
 """
 
 import dataclasses
-import importlib.metadata
+import functools
 import importlib.util
 import logging
 import multiprocessing
@@ -23,8 +23,9 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hjepa_cli import __version__
+from hjepa_cli import plugins
 from hjepa_cli.compute.interrupts import SIGNALS
+from hjepa_cli.compute.versions import NUMBERS_FROM, versions
 from hjepa_cli.errors import ClusterLost, HjepaError, NumericalError, UsageError
 
 MAX_WORKERS = 8  # of some 400 MB each
@@ -32,7 +33,6 @@ IN_FLIGHT = 4  # units submitted per worker: enough to keep it busy, few enough 
 LOCAL = "local"
 RETRIES = 3  # of a unit whose Dask worker died
 CONNECT_S = 10
-NUMBERS_FROM = ("numpy", "pymunk", "scipy", "torch")  # another version, other last digits
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -40,23 +40,14 @@ R = TypeVar("R")
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """Where the user wants parallel work.
+    """It says where the user wants parallel work."""
 
-    Attributes:
-        workers: processes; 0 is this one, ``None`` leaves it to the stage.
-        cluster: a Dask scheduler's address, its JSON file, or ``local``.
-    """
-
-    workers: int | None = None
-    cluster: str | None = None
+    workers: int | None = None  # processes; 0 is this one, None leaves it to the stage
+    cluster: str | None = None  # a Dask scheduler's address, its JSON file, or "local"
 
 
-_placement: ContextVar[Placement | None] = ContextVar("placement", default=None)
-
-
-def placement() -> Placement:
-    """What :func:`placed` set around the caller."""
-    return _placement.get() or Placement()
+_placement = ContextVar("placement", default=Placement())  # noqa: B039 (it is frozen)
+placement = _placement.get
 
 
 @contextmanager
@@ -78,14 +69,12 @@ def placed(workers: int | None = None, cluster: str | None = None) -> Iterator[N
 
 
 def cores() -> int:
-    """Cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 class InProcess(Executor):
-    """Runs each unit as it is submitted, in the caller's thread."""
+    """It runs each unit as it is submitted, in the caller's thread."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -98,10 +87,9 @@ class InProcess(Executor):
 
 @contextmanager
 def open_executor(workers: int) -> Iterator[tuple[Executor, int]]:
-    """The executor of the :func:`placement`, and how many workers it has.
+    """Open the executor of the :func:`placement`; also yield how many workers it has.
 
-    Args:
-        workers: processes where the user did not say; 0 is this one.
+    Without a word of the user it has ``workers`` processes; 0 is this one.
 
     Raises:
         UsageError: no scheduler answers.
@@ -109,8 +97,8 @@ def open_executor(workers: int) -> Iterator[tuple[Executor, int]]:
     where = placement()
     count = workers if where.workers is None else where.workers
     if where.cluster is not None:
-        with open_cluster(where.cluster, count or cores()) as opened:
-            yield opened
+        with open_cluster(where.cluster, count or cores()) as cluster:
+            yield cluster
     elif count == 0:
         yield InProcess(), 1
     else:
@@ -121,7 +109,7 @@ def open_executor(workers: int) -> Iterator[tuple[Executor, int]]:
 def finished(
     executor: Executor, workers: int, function: Callable[[T], R], units: Sequence[T]
 ) -> Iterator[R]:
-    """Results of ``function`` over ``units``, in the order in which they are ready.
+    """Yield results of ``function`` over ``units``, in the order in which they are ready.
 
     Only some are in flight at a time, so a million units take no memory and an interruption
     does not wait for them.
@@ -148,33 +136,29 @@ def broken_pool_reported() -> Iterator[None]:
     """Turn the death of a worker into one line."""
     try:
         yield
-    except BrokenProcessPool:
-        raise _worker_died() from None
     except Exception as error:
-        if type(error).__name__ == "KilledWorker":  # Dask's, after all retries
-            raise _worker_died() from None
+        # Dask raises KilledWorker after all retries.
+        if isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker":
+            raise NumericalError(
+                "a worker process died (out of memory?)",
+                hint="free some memory, then run the same command again",
+            ) from None
         raise
-
-
-def _worker_died() -> NumericalError:
-    return NumericalError(
-        "a worker process died (out of memory?)",
-        hint="free some memory, then run the same command again",
-    )
 
 
 @contextmanager
 def worker_pool(
     count: int, initializer: Callable[..., None], *arguments: Any
 ) -> Iterator[ProcessPoolExecutor]:
-    """Spawned processes, ended at once when the ``with`` block fails.
+    """Open a pool of spawned processes that end at once when the ``with`` block fails.
 
     Spawned, not forked: torch's threads do not survive a fork.
     """
     context = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())  # of the program that calls us
-    pool = ProcessPoolExecutor(count, context, initializer=initializer, initargs=arguments)
-    with anonymous_main():
+    begin = plugins.in_force(), initializer, *arguments
+    with spawning():
+        pool = ProcessPoolExecutor(count, context, initializer=with_plugins, initargs=begin)
         try:
             yield pool
         except BaseException:
@@ -185,15 +169,32 @@ def worker_pool(
             pool.shutdown(cancel_futures=True)
 
 
+def with_plugins(
+    sources: Sequence[plugins.Source], function: Callable[..., R], *arguments: Any, **named: Any
+) -> R:
+    """Call a function in a worker that has the plugins in force where it is wanted."""
+    plugins.ensure(sources)
+    return function(*arguments, **named)
+
+
+class WithPlugins(Executor):
+    """Its workers, whenever they join, have the plugins that are in force here."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._submit = functools.partial(executor.submit, with_plugins, plugins.in_force())
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return self._submit(fn, *args, **kwargs)
+
+
 @contextmanager
 def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
-    """A Dask cluster as an executor, and how many threads it has; ``local`` starts one.
+    """Open a Dask cluster as an executor, ``local`` a new one; also yield how many threads it has.
 
     Workers of other machines must have the same version installed and see the same files.
 
     Raises:
-        UsageError: no scheduler answers at ``where``, it has no workers, or they would compute
-            something else.
+        UsageError: no scheduler answers, it has no workers, or they would compute something else.
         ClusterLost: it ends before the ``with`` block.
     """
     import distributed
@@ -201,7 +202,7 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
     dask: Any = distributed  # it has no types
     for name in ("distributed", "distributed.client"):  # a lost worker is no news here
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    with anonymous_main():
+    with spawning():
         if where == LOCAL:
             with signals_blocked():
                 local = dask.LocalCluster(
@@ -223,7 +224,8 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
         try:
             check_cluster(client, where)
             threads = sum(client.nthreads().values())
-            yield client.get_executor(retries=RETRIES, pure=False), max(threads, 1)
+            executor = client.get_executor(retries=RETRIES, pure=False)
+            yield WithPlugins(executor) if plugins.in_force() else executor, max(threads, 1)
         except HjepaError:
             raise
         except Exception:
@@ -240,19 +242,8 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
                     target["address"].close()
 
 
-def versions() -> dict[str, str]:
-    """What the numbers of this process depend on."""
-    return {"hjepa": __version__} | {
-        name: importlib.metadata.version(name) for name in NUMBERS_FROM
-    }
-
-
 def check_cluster(client: Any, where: str) -> None:
-    """Demand workers, and of every one the versions that are here: others give other numbers.
-
-    Raises:
-        UsageError: naming what is missing or differs.
-    """
+    """Raise UsageError without workers, or with one of other versions, so of other numbers."""
     try:
         client.wait_for_workers(1, timeout=CONNECT_S)
     except TimeoutError:
@@ -260,9 +251,9 @@ def check_cluster(client: Any, where: str) -> None:
             f"--cluster {where}: the scheduler has no workers",
             hint="dask worker --nthreads 1 with the scheduler's address or --scheduler-file FILE",
         ) from None
-    here = versions()
+    here = versions(NUMBERS_FROM)
     try:
-        found: dict[str, dict[str, str]] = client.run(versions)
+        found: dict[str, dict[str, str]] = client.run(versions, NUMBERS_FROM)
     except Exception as error:  # whatever unpickling there raises
         raise UsageError(
             f"--cluster {where}: a worker cannot import hjepa: {error}",
@@ -279,20 +270,23 @@ def check_cluster(client: Any, where: str) -> None:
 
 
 @contextmanager
-def anonymous_main() -> Iterator[None]:
-    """Keep spawned processes from running the user's script again.
+def spawning() -> Iterator[None]:
+    """Keep spawned processes from the user's script and from modules of the current directory.
 
-    They would import it, which needs a ``__main__`` guard there and fails for standard input.
+    They would import the script, which needs a ``__main__`` guard there and fails for standard
+    input; and as they begin with ``python -c``, a ``pickle.py`` of the directory they are in.
     """
     main = sys.modules["__main__"].__dict__
-    spec, file = main["__spec__"], main.pop("__file__", None)
+    kept = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+    main.pop("__file__", None)
     main["__spec__"] = None
+    safe, os.environ["PYTHONSAFEPATH"] = os.environ.get("PYTHONSAFEPATH"), "1"
     try:
         yield
     finally:
-        main["__spec__"] = spec
-        if file is not None:
-            main["__file__"] = file
+        main.update(kept)
+        del os.environ["PYTHONSAFEPATH"]
+        os.environ |= {} if safe is None else {"PYTHONSAFEPATH": safe}
 
 
 @contextmanager
@@ -310,14 +304,14 @@ def signals_blocked() -> Iterator[None]:
 
 
 def prepare_worker() -> None:
-    """Ctrl-C and SIGTERM, which reach the whole group, are the parent's; a worker ends with it."""
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
+    """Leave Ctrl-C and SIGTERM, which reach the whole group, to the parent; end with it."""
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os._exit(1)
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)
+
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=end, daemon=True).start()

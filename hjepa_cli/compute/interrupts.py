@@ -9,7 +9,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
 from hjepa_cli.errors import Interrupted
@@ -18,7 +18,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as a batch system sends it before it kills."""
+    """SIGTERM has come, as a batch system sends it before it kills."""
 
 
 @contextmanager
@@ -35,12 +35,12 @@ def sigterm_raises() -> Iterator[None]:
 
 
 def exit_code(error: BaseException) -> int:
-    """What the shell sees of an interruption: 128 + the signal's number."""
+    """Return what the shell sees of an interruption: 128 + the signal's number."""
     return 128 + (signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT)
 
 
 class Postponed:
-    """Handlers of both signals while it is entered; see :meth:`postpone`."""
+    """It handles both signals while it is entered; see :meth:`postpone`."""
 
     def __init__(self) -> None:
         self._inside = False
@@ -59,7 +59,7 @@ class Postponed:
             _raise(self._signal, None)
 
     def interrupted(self, message: str, hint: str) -> Interrupted:
-        """The error to raise for the signal that was kept back."""
+        """Return the error to raise for the signal that was kept back."""
         # Without one, another process of the training was stopped: torchrun sends SIGTERM.
         return Interrupted(message, hint=hint, code=128 + (self._signal or signal.SIGTERM))
 
@@ -68,12 +68,7 @@ class Postponed:
             self._before = {number: signal.signal(number, self._handle) for number in SIGNALS}
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 

@@ -8,10 +8,5 @@ import numpy as np
 
 
 def generator(seed: int, *key: int) -> np.random.Generator:
-    """Return the random stream named ``key`` under ``seed``.
-
-    Args:
-        seed: the run's seed, a non-negative integer.
-        key: non-negative integers that name the stream, for example stage, split, index.
-    """
+    """Return the stream of a run's ``seed`` that ``key`` names: say stage, split, index."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=key)))

@@ -1,7 +1,7 @@
 """What ``torchrun`` tells the processes that it starts; imports nothing heavy.
 
-Several processes train one encoder (:mod:`hjepa_cli.core.training.ranks`). The first leads: it alone prints
-and writes files.
+Several processes train one encoder (:mod:`hjepa_cli.core.training.ranks`). The first leads: it
+alone prints and writes files.
 """
 
 import os
@@ -10,7 +10,7 @@ from hjepa_cli.errors import HjepaError, NumericalError, UsageError
 
 
 class OneOfSeveral(HjepaError):
-    """What only one process knows, so that it prints it although it does not lead."""
+    """Only one process knows this error, so it prints it without leading."""
 
 
 class ContactLost(NumericalError, OneOfSeveral):
@@ -18,22 +18,22 @@ class ContactLost(NumericalError, OneOfSeveral):
 
 
 def size() -> int:
-    """Processes that train together; 1 without torchrun."""
+    """Return how many processes train together; 1 without torchrun."""
     return int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
 
 
 def rank() -> int:
-    """The number of this one, from 0."""
+    """Return the number of this one, from 0."""
     return int(os.environ["RANK"]) if size() > 1 else 0
 
 
 def follows() -> bool:
-    """Another process leads."""
+    """Return whether another process leads."""
     return rank() > 0
 
 
 def program() -> str:
-    """How this program was started, for hints."""
+    """Return how this program was started, for hints."""
     if size() == 1:
         return "hjepa"
     here = int(os.environ["LOCAL_WORLD_SIZE"])

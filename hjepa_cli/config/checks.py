@@ -1,151 +1,84 @@
 """Rules that settings must meet before anything is read, written or imported.
 
-``settings.py`` checks types and names; here are the values. Every message names the setting, what
-it is and what it may be, whether it came from a flag or a file.
+``schema.py`` declares the type and the bounds of each value; here are the names, and what values
+must be to each other. Every message names the setting, what it is and what it may be.
 """
 
+import dataclasses
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Integral
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from hjepa_cli.config.settings import (
+from hjepa_cli.config.schema import (
     EncoderSettings,
     ProtocolSettings,
     RadioSettings,
     Settings,
-    dotted,
+    declared,
+    flag_of,
 )
+from hjepa_cli.config.settings import PRESETS, load_settings, validated
 from hjepa_cli.errors import UsageError
-from hjepa_cli.plugins import PLANTS
-
-# Every method `eval` and `scale` may be asked for; those without a model are skipped.
-METHODS = (
-    "hjepa",
-    "ts-jepa-1",
-    "ts-jepa-2",
-    "ts-jepa-3",
-    "ts-jepa-4",
-    "ts-jepa-5",
-    "supervised-2",
-    "supervised-4",
-    "autoencoder-2",
-    "hold",
-    "zero",
-    "hold-decay",
-    "hold-decay-linear",
-    "chunk",
-    "chunk-forces",
-    "hold-true",
-    "zero-true",
-    "optimal",
-    "oracle",
-    "linear",
-    "state-kf",
-    "state-48",
-    "local",
-)
-
-# Those of train-reflex: functions of the last packet and its age, without a predictor.
-REFLEXES = ("hold-decay", "hold-decay-linear", "chunk", "chunk-forces")
-
-# The paper's Fig. 3, and the ceiling of prediction.
-COMPARED = (
-    *("hjepa", "ts-jepa-1", "ts-jepa-2", "ts-jepa-3", "ts-jepa-4", "ts-jepa-5"),
-    *("supervised-2", "supervised-4", "autoencoder-2", "hold", "zero", "optimal", "oracle"),
-)
-
-# Those that send the true state: they render and encode nothing.
-TRUE_STATE = ("hold-true", "zero-true", "optimal", "oracle")
-
-# Those that send camera frames as they are and act on them: no codec, no prediction.
-RAW_FRAMES = ("supervised-2", "supervised-4", "autoencoder-2")
+from hjepa_cli.plugins import CODECS, LAWS, METHODS, PLANTS, SCHEDULERS
 
 LATE = "+"  # between a method and the steps that its packets are late
 
-# Those whose packets need no link, or that send none.
-LINKLESS = ("optimal", "local")
-
-ANY_DEPTH = re.compile(r"ts-jepa-[1-9]\d{0,4}")  # of a level that somebody trains
-
-# Those fitted in closed form to embeddings, where they are measured.
-ANCHORS = ("linear", "state-kf", "state-48", "local")
-
 FRAMES = {"jepa": (2,), "supervised": (2, 4), "autoencoder": (2,)}  # κ, by --method
 
-SCHEDULERS = (
-    *("round-robin", "opportunistic", "max-aoi", "drift-plus-penalty", "whittle"),
-    "innovation",
-)
-
-FLAGS_OF_LAWS = {  # of `scale`; all others mean something under each law
-    "--scheduler": ("scheduled",),
-    "--uncertainty": ("scheduled",),
-    "--topology": ("scheduled",),
-    "--power-margin-db": ("scheduled",),
-    "--coherence-slots": ("scheduled",),
-    "--seeds": ("scheduled",),
-    "--noise": ("equal",),
-    "--remeasure": ("duty", "equal"),
-    "--dataset": ("duty", "equal"),
-}
-
-CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
-MAX_HARQ_ROUNDS = 16
-LARGEST_SEED = 2**63 - 1
-LARGEST_BANDWIDTH_HZ = 1e11  # beyond any radio band; keeps device counts in range
 LARGEST_STRIDE = 10_000
-# Counts that may be 0, and those of at least two: nothing is learned without a next one.
-FROM_TWO = ("collect.steps", "encoder.batch_frames")
-ZERO_ALLOWED = (
-    *("seed", "encoder.shift_px", "hierarchy.shifted_copies", "radio.overhead_bits"),
-    "protocol.warmup_steps",
-)
-NEGATIVE_ALLOWED = ("encoder.gate_", "radio.power_dbm")  # thresholds of R²; decibels
-POSITIVE = (
-    *("radio.bandwidth_hz", "protocol.acceptable_score", "protocol.bracket"),
-    *("conditions.light", "conditions.pole_length"),
-)
-BELOW_ONE = (
-    *("actor.dropout", "encoder.ema_decay", "encoder.light_spread"),
-    *("protocol.plant_spread", "protocol.bracket"),
-)
+
+# What is read of a cell in one topology only, and what a simulation of one uplink reads of it.
+TOPOLOGIES = {
+    "radio.power_margin_db": "target",
+    **dict.fromkeys(("radio.scenario", "radio.carrier_ghz", "radio.power_dbm"), "hall"),
+    "radio.noise_figure_db": "hall",
+}
+UPLINK = ("radio.power_margin_db", "radio.coherence_slots", "radio.block_error")
+
+
+def resolve(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -> Settings:
+    """Merge preset, file and flags; refuse values that make no sense before anything is touched."""
+    plant = flags["plant"]
+    settings = load_settings(preset, config, flags)
+    held = [load_settings(settings.preset, file).plant for file in (None, config)]
+    if plant is not None and plant not in held:
+        other = f"--preset {plant} for plant {plant}; other values of it by --config FILE.toml"
+        own = f'--config FILE.toml with plant = "{plant}" and its values'
+        raise UsageError(
+            f"preset '{settings.preset}' holds the ranges and noise of plant '{held[0]}', "
+            f"not of '{plant}'",
+            hint=other if plant in PRESETS else own,
+        )
+    check_settings(settings)
+    return settings
 
 
 def check_settings(settings: Settings) -> None:
-    """Check every value that has a rule.
+    """Raise UsageError naming the first setting that breaks a rule, and its valid values.
 
-    Raises:
-        UsageError: naming the first setting that breaks one, and its valid values.
+    Settings that were made or changed in Python have not met any of the rules before.
     """
-    for key, value in _numbers(settings.as_dict()):
-        _check_number(key, value)
-    if settings.seed > LARGEST_SEED:
-        raise UsageError(f"seed = {settings.seed}; expected at most {LARGEST_SEED}")
+    validated(dataclasses.asdict(settings))
     check_strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
-    _check_frames(settings.encoder)
-    _check_halves(settings.encoder)
+    _check_encoder(settings.encoder)
     check_methods(settings.methods)
     gaps = settings.protocol.gaps
     if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
         raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on")
-    parse_payload(settings.protocol.payload)
-    _check_radio(settings.radio)
-    if settings.radio.bandwidth_hz > LARGEST_BANDWIDTH_HZ:
-        raise UsageError(
-            f"radio.bandwidth_hz = {settings.radio.bandwidth_hz:g}; "
-            f"expected at most {LARGEST_BANDWIDTH_HZ:g}"
-        )
+    check_payload(settings.protocol.payload)
+    if not settings.radio.schedulers:
+        raise UsageError(f"no scheduler given; choose from {', '.join(SCHEDULERS)}")
+    for scheduler in settings.radio.schedulers:
+        SCHEDULERS[scheduler]
     if settings.conditions.pole_length != 1:
         PLANTS[settings.plant].with_pole_length(settings.conditions.pole_length)
 
 
 def check_strides(h: int, m: int, l: int) -> None:
-    """Check that the strides of the three levels nest: h a multiple of m, m a multiple of l.
-
-    Raises:
-        UsageError: naming the strides that would do.
-    """
+    """Raise UsageError, naming strides that would do, unless m divides h, and l divides m."""
     if not 1 <= h <= LARGEST_STRIDE:
         raise UsageError(f"--h {h}; expected 1 to {LARGEST_STRIDE}")
     fitting_m = _largest_divisor(h, m)
@@ -162,24 +95,40 @@ def check_strides(h: int, m: int, l: int) -> None:
 
 
 def check_methods(methods: tuple[str, ...]) -> None:
-    """Check method names.
-
-    Raises:
-        UsageError: no name, or a name that no method has (``ts-jepa-N`` is one for any depth N).
-    """
+    """Raise UsageError for no name, or one that no method has (of ``ts-jepa-N``, any N has)."""
     if not methods:
         raise UsageError(f"no method given; choose from {', '.join(METHODS)}")
     for method in methods:
-        if method not in METHODS and not ANY_DEPTH.fullmatch(method):
-            raise UsageError(f"unknown method '{method}'; choose from {', '.join(METHODS)}")
+        METHODS[method]
+
+
+def needs_model(method: str) -> bool:
+    """Return whether a method, on time or late, needs a trained model; unknown ones do."""
+    name = method.partition(LATE)[0]
+    return name not in METHODS or METHODS[name].needs_model
+
+
+def without_model() -> tuple[str, ...]:
+    """Return the methods that need no trained model."""
+    return tuple(name for name in METHODS if not METHODS[name].needs_model)
+
+
+def compared_methods() -> tuple[str, ...]:
+    """Return the methods of the paper's Fig. 3, and the ceiling of prediction."""
+    return tuple(name for name in METHODS if METHODS[name].compared)
+
+
+def check_payload(name: str) -> None:
+    """Raise UsageError where no codec is called so."""
+    if name not in CODECS:
+        described = [getattr(codec, "described", codec.name) for codec in CODECS.values()]
+        raise UsageError(
+            f"unknown payload '{name}'; choose {', '.join(described[:-1])}, or {described[-1]}"
+        )
 
 
 def check_warmup(protocol: ProtocolSettings) -> None:
-    """Check that no less is scored than was left out before.
-
-    Raises:
-        UsageError: fewer scored steps than the warm-up has.
-    """
+    """Raise UsageError for fewer scored steps than the warm-up before them has."""
     if protocol.steps < protocol.warmup_steps:
         raise UsageError(
             f"protocol.steps = {protocol.steps} are scored after protocol.warmup_steps = "
@@ -190,11 +139,7 @@ def check_warmup(protocol: ProtocolSettings) -> None:
 
 
 def check_gaps(protocol: ProtocolSettings) -> None:
-    """Check that what is scored is long enough for the gaps between packets.
-
-    Raises:
-        UsageError: fewer scored steps than the warm-up has, or than the longest gap.
-    """
+    """Raise UsageError for fewer scored steps than the warm-up has, or than the longest gap."""
     check_warmup(protocol)
     if (longest := protocol.gaps[-1]) > protocol.steps:
         raise UsageError(
@@ -204,37 +149,70 @@ def check_gaps(protocol: ProtocolSettings) -> None:
         )
 
 
-def check_flags_of_law(law: str, given: Mapping[str, bool]) -> None:
-    """Check that flags of ``scale`` that were given mean something under its law.
+def check_cell(radio: RadioSettings, given: Mapping[str, object] = MappingProxyType({})) -> None:
+    """Raise UsageError for what was set of a cell and is not read, naming what would read it.
 
-    Raises:
-        UsageError: naming the law that the flag is for.
+    Set is what differs from the defaults; and of ``given``, the flags by the key of their setting
+    or input, all that is neither ``None`` nor ``False``.
     """
-    for flag, laws in FLAGS_OF_LAWS.items():
-        if given[flag] and law not in laws:
+    flags = [key for key, value in given.items() if value not in (None, False)]
+    unlike = changed(radio)
+    for key in dict.fromkeys((*flags, *unlike)):
+        flag = flag_of(declared()[key]) if key in declared() else None
+        named = f"{key} = {unlike.get(key)!r}"
+        if key in flags:
+            named = flag.name if flag else f"--{key}"
+        laws = [law for law in LAWS if key in LAWS[law].uses]
+        if laws and radio.law not in laws:
             raise UsageError(
-                f"{flag} is for the law {' or '.join(laws)}, this is {law}",
-                hint=f"hjepa scale --law {laws[0]} {flag} …, or leave out {flag}",
+                f"{named} is for the law {' or '.join(laws)}, this is {radio.law}",
+                hint=f"hjepa scale --law {laws[0]} …, or leave out {named}",
+            )
+        topology = TOPOLOGIES.get(key, radio.topology)
+        if topology != radio.topology:
+            raise UsageError(
+                f"{named} is for the topology {topology}, this is {radio.topology}",
+                hint=f"hjepa scale --law scheduled --topology {topology} …, or leave out {named}",
+            )
+    if radio.harq_rounds > 1 and radio.block_error == 0:
+        raise UsageError(
+            f"radio.harq_rounds = {radio.harq_rounds} is for a radio.block_error above 0; without "
+            "one no packet is repeated",
+            hint="set block_error in --config FILE.toml, or leave out harq_rounds",
+        )
+
+
+def check_uplink(radio: RadioSettings) -> None:
+    """Raise UsageError for what was set of a cell and a simulation of one uplink does not read."""
+    for key, value in changed(radio).items():
+        if key not in UPLINK and (key, value) != ("radio.law", "scheduled"):
+            raise UsageError(
+                f"{key} = {value!r} is for hjepa scale; simulate_cell reads {', '.join(UPLINK)}",
+                hint="hjepa scale --law scheduled, or leave it out",
             )
 
 
-def check_schedulable(methods: Sequence[str], steps: int) -> None:
-    """Check that methods can compete for the slots of one uplink, and that there are slots to win.
+def changed(radio: RadioSettings) -> dict[str, Any]:
+    """Return the settings of a cell that are not as declared, by dotted key."""
+    values = {field: getattr(radio, field.name) for field in dataclasses.fields(radio)}
+    return {f"radio.{field.name}": v for field, v in values.items() if v != field.default}
 
-    Raises:
-        UsageError: packets that take several slots, come late or need no link, or fewer than two
-            steps.
+
+def check_schedulable(methods: Sequence[str], steps: int) -> None:
+    """Raise UsageError for methods that cannot compete for the slots of one uplink.
+
+    Their packets take several slots, come late or need no link, or there are fewer than two slots.
     """
-    if raw := [name for name in methods if split_late(name)[0] in RAW_FRAMES]:
+    described = {name: METHODS[split_late(name)[0]] for name in methods}
+    if raw := [name for name, method in described.items() if method.sends == "frames"]:
         raise UsageError(
             f"law scheduled fits packets into slots; {', '.join(raw)} needs several slots for one",
             hint="choose --law duty for it, or other --methods",
         )
-    for name in methods:
-        method, delay_steps = split_late(name)
-        if method in LINKLESS:
+    for name, method in described.items():
+        if not method.needs_link:
             raise UsageError(f"'{name}' has no link to share; choose a method that has one")
-        if delay_steps:
+        if split_late(name)[1]:
             raise UsageError(f"'{name}': under law scheduled packets arrive in the slot they get")
     if steps < 2:
         raise UsageError(
@@ -244,112 +222,33 @@ def check_schedulable(methods: Sequence[str], steps: int) -> None:
 
 
 def check_count(name: str, value: object) -> None:
-    """Check what is given from Python as a number of something.
-
-    Raises:
-        UsageError: not a whole number of at least 1.
-    """
+    """Raise UsageError for a number of something, from Python, that is no whole one from 1 on."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
         raise UsageError(f"{name} = {value}; expected a whole number, at least 1")
 
 
 def late(method: str, steps: int) -> str:
-    """A method whose packets arrive ``steps`` steps after they were sent: ``supervised-2+3``."""
+    """Name a method whose packets arrive so many steps after they were sent: ``supervised-2+3``."""
     return f"{method}{LATE}{steps}" if steps else method
 
 
 def split_late(name: str) -> tuple[str, int]:
-    """The method behind :func:`late`, and the steps.
-
-    Raises:
-        UsageError: what follows the sign is no number of steps.
-    """
+    """Return the method behind :func:`late`, and the steps; raise UsageError for other endings."""
     method, sign, steps = name.partition(LATE)
     if sign and not re.fullmatch(r"[0-9]{1,18}", steps):
         raise UsageError(f"method '{name}'; expected whole steps after the {LATE}: {method}{LATE}3")
     return method, int(steps or 0)
 
 
-def parse_payload(name: str) -> tuple[str, int, int]:
-    """Read the name of a payload.
-
-    Returns:
-        Its kind (``float32``, ``float16``, ``int``, ``pca``), bits per value, and components.
-
-    Raises:
-        UsageError: no such payload.
-    """
-    if name in ("float32", "float16"):
-        return name, int(name[-2:]), 0
-    if (whole := re.fullmatch(r"int(\d{1,2})", name)) and 2 <= int(whole[1]) <= 16:
-        return "int", int(whole[1]), 0
-    parts = re.fullmatch(r"pca-(\d{1,3})x(\d{1,2})", name)
-    if parts and 1 <= int(parts[1]) <= 256 and 1 <= int(parts[2]) <= 16:
-        return "pca", int(parts[2]), int(parts[1])
-    raise UsageError(
-        f"unknown payload '{name}'; choose float32, float16, int2 … int16, or pca-NxB for N "
-        "principal components (1 to 256) of B bits (1 to 16), like pca-8x6"
-    )
-
-
-def _check_frames(encoder: EncoderSettings) -> None:
-    taken = FRAMES[encoder.method]
-    if encoder.frames not in taken:
-        choices = " or ".join(str(count) for count in taken)
+def _check_encoder(encoder: EncoderSettings) -> None:
+    if encoder.frames not in FRAMES[encoder.method]:
+        choices = " or ".join(map(str, FRAMES[encoder.method]))
         raise UsageError(f"--frames {encoder.frames}: method {encoder.method} takes {choices}")
-
-
-def _check_halves(encoder: EncoderSettings) -> None:
     if encoder.mirror == "exact" and encoder.embedding % 2:
         raise UsageError(
             f"encoder.embedding = {encoder.embedding}; expected an even number, for a half that a "
             'mirror keeps and one that it negates, or mirror = "augment" or "none"'
         )
-
-
-def _check_radio(radio: RadioSettings) -> None:
-    if not radio.schedulers:
-        raise UsageError(f"no scheduler given; choose from {', '.join(SCHEDULERS)}")
-    for scheduler in radio.schedulers:
-        if scheduler not in SCHEDULERS:
-            raise UsageError(
-                f"unknown scheduler '{scheduler}'; choose from {', '.join(SCHEDULERS)}"
-            )
-    low, high = CARRIER_GHZ
-    if not low <= radio.carrier_ghz <= high:
-        raise UsageError(f"radio.carrier_ghz = {radio.carrier_ghz:g}; expected {low:g} to {high:g}")
-    if radio.coherence_slots < 1:
-        raise UsageError(f"radio.coherence_slots = {radio.coherence_slots:g}; expected 1 or more")
-    if radio.block_error > 0.5:
-        raise UsageError(f"radio.block_error = {radio.block_error:g}; expected at most 0.5")
-    if radio.harq_rounds > MAX_HARQ_ROUNDS:
-        raise UsageError(
-            f"radio.harq_rounds = {radio.harq_rounds}; expected 1 to {MAX_HARQ_ROUNDS}"
-        )
-    if radio.topology == "hall" and radio.law != "scheduled":
-        raise UsageError(
-            f"topology hall is for the law scheduled; law {radio.law} starts from the SNR itself"
-        )
-
-
-def _check_number(key: str, value: float) -> None:
-    least = 0 if key in ZERO_ALLOWED else 2 if key in FROM_TWO else 1
-    if isinstance(value, int) and value < least:
-        raise UsageError(f"{key} = {value}; expected at least {least}")
-    if value <= 0 and key in POSITIVE:
-        raise UsageError(f"{key} = {value}; expected more than 0")
-    if value < 0 and not key.startswith(NEGATIVE_ALLOWED):
-        raise UsageError(f"{key} = {value}; expected at least 0")
-    if value >= 1 and key in BELOW_ONE:
-        raise UsageError(f"{key} = {value}; expected less than 1")
-
-
-def _numbers(values: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """Every number of nested settings with its dotted key; those in lists one by one."""
-    for key, value in dotted(values).items():
-        for entry in value if isinstance(value, list) else [value]:
-            if isinstance(entry, int | float) and not isinstance(entry, bool):
-                yield key, entry
 
 
 def _divisors(number: int) -> list[int]:

@@ -1,278 +1,51 @@
-"""Settings: one frozen dataclass per stage, filled from TOML presets and overridden by flags.
+"""Settings from their layers: declared defaults < preset < protocol < ``--config`` < flags.
 
-``presets/default.toml`` holds every value and is the only place where defaults live; the other
-presets, ``--config FILE.toml`` and flags override single values of it. Precedence: flag >
-``--config`` > ``--preset`` > default.
+The defaults are those of :mod:`hjepa_cli.config.schema`; presets (TOML files in ``presets/``),
+``--config FILE.toml`` and flags override single values.
 """
 
 import dataclasses
 import difflib
-import math
-import sys
+import functools
+import operator
+import re
 import tomllib
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+import msgspec
+
+from hjepa_cli.config.schema import PAPER_PROTOCOL, Settings, bare, declared, dotted, must_be
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.plugins import PLANTS
-
-T = typing.TypeVar("T")
+from hjepa_cli.plugins import LAWS, PLANTS
 
 CONFIG_LIMIT_BYTES = 2**20
-_SHIPPED = sorted(
-    Path(entry.name).stem for entry in (resources.files("hjepa_cli.config") / "presets").iterdir()
-)
-PRESETS = ("default", *(name for name in _SHIPPED if name != "default"))
+_FOLDER = resources.files("hjepa_cli.config") / "presets"
+PRESETS = ("default", *sorted(Path(entry.name).stem for entry in _FOLDER.iterdir()))
 PROTOCOLS = ("steady", "paper")  # scored after a warm-up, or from the start on as in the paper
 
 
 @dataclasses.dataclass(frozen=True)
-class CollectSettings:
-    """``collect``: how the dataset is made."""
+class Layer:
+    """Values of one source: a preset, a protocol, a file (then with its ``text``), or a flag."""
 
-    trajectories: int
-    test_trajectories: int
-    clean_trajectories: int
-    steps: int
-    clean_steps: int
-    start: tuple[float, ...]  # initial states are uniform in ± these; none: a cart-pole's four
-    x_m: float
-    x_dot_m_s: float
-    theta_rad: float
-    theta_dot_rad_s: float
-    exploration_n: float
-    exploration_hold_steps: int
-    frames: Literal["rendered", "stored"]
+    source: str
+    values: dict[str, Any]
+    text: str | None = None
 
-    @property
-    def half_widths(self) -> tuple[float, ...]:
-        """Of the initial states, one per state."""
-        return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
-
-
-@dataclasses.dataclass(frozen=True)
-class EncoderSettings:
-    """``train-encoder``: the JEPA with its companion P^H, then the probe actor; or a baseline."""
-
-    method: Literal["jepa", "supervised", "autoencoder"]
-    frames: int  # κ, of the input
-    embedding: int
-    hidden: int
-    h: int
-    frame_input: Literal["difference", "pair"]
-    stride_actions: Literal["all", "held"]
-    residual: bool
-    centre: bool
-    steps: int
-    batch_trajectories: int
-    batch_frames: int
-    rollout_steps: int
-    optimizer: Literal["adamw", "sgd"]
-    schedule: Literal["one-cycle", "constant"]
-    learning_rate: float
-    weight_decay: float
-    gradient_clip: float
-    ema_decay: float
-    inverse_dynamics: float
-    regulariser: Literal["none", "vicreg", "sigreg"]
-    regulariser_weight: float
-    mirror: Literal["exact", "augment", "none"]
-    shift_px: int
-    light_spread: float
-    camera_noise: float
-    precision: Literal["auto", "bf16", "fp32"]
-    gate: bool
-    gate_r2: tuple[float, ...]  # one per state; none: a cart-pole's four
-    gate_r2_x: float
-    gate_r2_x_dot: float
-    gate_r2_theta: float
-    gate_r2_theta_dot: float
-    gate_rank: float
-    gate_sensitivity: float
-    gate_actor_nrmse: float
-
-    @property
-    def least_r2(self) -> tuple[float, ...]:
-        """The gates of the linear probes, one per state."""
-        four = (self.gate_r2_x, self.gate_r2_x_dot, self.gate_r2_theta, self.gate_r2_theta_dot)
-        return self.gate_r2 or four
-
-
-@dataclasses.dataclass(frozen=True)
-class ActorSettings:
-    """The semantic actor, fitted by both training stages."""
-
-    hidden: int
-    dropout: float
-    schedule: Literal["one-cycle", "constant"]
-    learning_rate: float
-    weight_decay: float
-    gradient_clip: float
-    batch: int
-    epochs: int
-
-
-@dataclasses.dataclass(frozen=True)
-class HierarchySettings:
-    """``train-hierarchy``: P^H, P^M, P^L and ts-jepa-1 on frozen embeddings."""
-
-    h: int
-    m: int
-    l: int
-    shifted_copies: int
-    rollout_steps: int
-    batch_trajectories: int
-    coarse_starts: int
-    flat_starts: int
-    fine_trajectories: int
-    optimizer: Literal["adamw", "sgd"]
-    schedule: Literal["one-cycle", "constant"]
-    gradient_clip: float
-    coarse_steps: int
-    coarse_learning_rate: float
-    coarse_weight_decay: float
-    flat_steps: int
-    medium_steps: int
-    medium_learning_rate: float
-    medium_weight_decay: float
-    low_steps: int
-    low_learning_rate: float
-    low_weight_decay: float
-
-
-@dataclasses.dataclass(frozen=True)
-class ReflexSettings:
-    """``train-reflex``: what answers a packet by its age, and the search for decaying holds."""
-
-    forces_at_once: int
-    steps: int
-    batch_packets: int
-    batch_ages: int
-    learning_rate: float
-    weight_decay: float
-    gradient_clip: float
-    search_devices: int
-    search_steps: int
-    search_candidates: int
-    search_rounds: int
-    fit_devices: int
-    fit_candidates: int
-    fit_rounds: int
-
-
-@dataclasses.dataclass(frozen=True)
-class ProtocolSettings:
-    """``eval`` and ``scale``: the closed-loop protocol."""
-
-    warmup_steps: int  # not scored
-    steps: int  # scored
-    curve_devices: int
-    bracket_devices: int
-    start: tuple[float, ...]  # as in [collect]
-    x_m: float
-    x_dot_m_s: float
-    theta_rad: float
-    theta_dot_rad_s: float
-    noise: tuple[float, ...]  # standard deviation per control step; none: a cart-pole's two
-    noise_x_dot_m_s: float
-    noise_theta_dot_rad_s: float
-    process_noise: Literal["velocity", "isotropic"]
-    plant_spread: float
-    payload: str
-    gaps: tuple[int, ...]
-    acceptable_score: float
-    acceptable_lq_ratio: float
-    bracket: float
-    horizon: int
-    bootstrap: int
-
-    @property
-    def half_widths(self) -> tuple[float, ...]:
-        """Of the initial states, one per state."""
-        return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
-
-    @property
-    def total_steps(self) -> int:
-        """Steps of a simulation: the warm-up, then those that are scored."""
-        return self.warmup_steps + self.steps
-
-    @property
-    def velocity_noise(self) -> tuple[float, ...]:
-        """Standard deviation of what disturbs a step, one per state; 0 for positions."""
-        return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
-
-
-@dataclasses.dataclass(frozen=True)
-class ConditionSettings:
-    """``eval`` and ``scale``: how devices differ from those that models were trained on."""
-
-    light: float
-    camera_noise: float
-    pole_length: float
-
-
-@dataclasses.dataclass(frozen=True)
-class RadioSettings:
-    """``scale``: the radio cell."""
-
-    law: Literal["duty", "equal", "scheduled"]
-    snr_db: str
-    bandwidth_hz: float
-    noise: Literal["fixed", "scaled"]
-    schedulers: tuple[str, ...]  # the rest is for the law "scheduled"
-    uncertainty: Literal["age", "levels"]
-    seeds: int
-    power_margin_db: float
-    coherence_slots: float
-    overhead_bits: int
-    block_error: float
-    harq_rounds: int
-    topology: Literal["target", "hall"]
-    scenario: Literal["InF-LOS", "InF-SL", "InF-DL", "InF-SH", "InF-DH"]
-    carrier_ghz: float
-    power_dbm: float
-    noise_figure_db: float
-
-    @property
-    def load_depends_on_snr(self) -> bool:
-        """Law scheduled: by the halls' margins, or by what several copies of a packet are worth."""
-        return self.topology == "hall" or (self.harq_rounds > 1 and self.block_error > 0)
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """Everything that defines a run besides the paths it reads and writes."""
-
-    preset: str
-    plant: str  # one of PLANTS
-    seed: int
-    device: Literal["auto", "cpu", "cuda"]
-    methods: tuple[str, ...]
-    collect: CollectSettings
-    encoder: EncoderSettings
-    actor: ActorSettings
-    hierarchy: HierarchySettings
-    reflex: ReflexSettings
-    protocol: ProtocolSettings
-    conditions: ConditionSettings
-    radio: RadioSettings
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return nested plain data, ready for JSON (tuples become lists).
-
-        Empty lists are left out: they stand for values that say the same, and digests of settings
-        stay what they were before there were such lists.
-        """
-        return typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+    def place(self, key: str) -> str:
+        """Return where a file sets a key, for a message: `` in c.toml, line 3``; else nothing."""
+        if self.text is None:
+            return ""
+        line = _line_of(self.text, key)
+        return f" in {self.source}" if line is None else f" in {self.source}, line {line}"
 
 
 def load_settings(
-    preset: str | None = None,
-    config: Path | None = None,
-    flags: Mapping[str, Any] | None = None,
+    preset: str | None = None, config: Path | None = None, flags: Mapping[str, Any] | None = None
 ) -> Settings:
     """Merge default < preset < config file < flags.
 
@@ -281,102 +54,97 @@ def load_settings(
     Args:
         preset: one of :data:`PRESETS`; ``None`` is that of the plant, else ``"default"``.
         config: a TOML file of the same shape as the presets.
-        flags: dotted key (``"collect.steps"``) to value; ``None`` values were not given. The key
-            ``"protocol"`` takes one of :data:`PROTOCOLS`, which sets several values between
-            preset and config file.
+        flags: values by dotted key (``"collect.steps"``), ``None`` where not given; ``"protocol"``
+            is one of :data:`PROTOCOLS`, which sets several between preset and config file.
 
     Raises:
-        UsageError: unknown preset, protocol or key, or a value of the wrong type, naming the valid
-            choices.
+        UsageError: unknown preset, protocol or key, or a value of the wrong type or out of bounds,
+            naming the key, what it must be, and the file and line that set it.
         MissingInputError: the config file is not there.
         DataError: the config file is not TOML.
     """
-    name = preset or _preset_of_plant(config, flags or {})
+    name, layers = _layers(preset, config, flags or {})
     values: dict[str, Any] = {}
-    for source, changes in _layers(name, config, flags or {}):
-        if values:
-            _override(values, changes, source)
-        else:
-            values = changes
-    settings = _build(Settings, values | {"preset": name}, "")
-    if settings.plant not in PLANTS:
-        raise UsageError(f"plant = {settings.plant!r}; choose one of {', '.join(PLANTS)}")
+    for layer in layers:
+        _merge(values, layer.values, layer)
+
+    def place(key: str) -> str:
+        return next(one for one in reversed(layers) if key in dotted(one.values)).place(key)
+
+    settings = validated(values | {"preset": name}, place)
+    for key, names in (("plant", PLANTS), ("radio.law", LAWS)):
+        if (value := operator.attrgetter(key)(settings)) not in names:
+            choices = ", ".join(names)
+            raise UsageError(f"{key} = {value!r}{place(key)}; choose one of {choices}")
     return settings
 
 
 def origins(
-    preset: str | None = None,
-    config: Path | None = None,
-    flags: Mapping[str, Any] | None = None,
+    preset: str | None = None, config: Path | None = None, flags: Mapping[str, Any] | None = None
 ) -> dict[str, str]:
-    """Where each value of :func:`load_settings` comes from.
+    """Return where each value of :func:`load_settings` comes from, by dotted key.
 
-    Returns:
-        Dotted key to ``"default"``, ``"preset NAME"``, ``"protocol paper"``, the config file's path
-        or ``"flag"``.
-
-    Raises:
-        As :func:`load_settings`.
+    That is ``"default"``, ``"preset NAME"``, ``"protocol paper"``, the config file's path or
+    ``"flag"``.
     """
-    flags = flags or {}
-    layers = _layers(preset or _preset_of_plant(config, flags), config, flags)
-    return {key: source for source, changes in layers for key in dotted(changes)}
+    _, layers = _layers(preset, config, flags or {})
+    return {key: layer.source for layer in layers for key in dotted(layer.values)}
 
 
-def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
-    """Nested values by the path to them: ``{"a": {"b": 1}}`` → ``{"a.b": 1}``."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            below = dotted(value, separator)
-            flat |= {f"{key}{separator}{name}": entry for name, entry in below.items()}
-        else:
-            flat[key] = value
-    return flat
+def validated(values: Mapping[str, Any], place: Callable[[str], str] = lambda key: "") -> Settings:
+    """Make settings of nested values, each of the type and within the bounds of its declaration.
 
-
-def _preset_of_plant(config: Path | None, flags: Mapping[str, Any]) -> str:
-    plant = flags.get("plant") or (_read_config(config).get("plant") if config else None)
-    return plant if plant in PRESETS else "default"
+    Raise UsageError naming the key, its value, its ``place``, and what it must be.
+    """
+    try:
+        return msgspec.convert(values, Settings)
+    except msgspec.ValidationError as error:
+        path = str(error).rpartition("`$.")[2].rstrip("`")  # as protocol.gaps[1]
+    key, _, index = path.rstrip("]").partition("[")
+    hint, value = declared()[key], functools.reduce(operator.getitem, key.split("."), values)
+    if index:
+        hint, value = typing.get_args(bare(hint))[0], value[int(index)]
+    wanted = must_be(hint)
+    verb = "choose" if wanted.startswith("one of") else "expected"
+    raise UsageError(f"{path} = {value!r}{place(key)}; {verb} {wanted}")
 
 
 def _layers(
-    preset: str, config: Path | None, flags: Mapping[str, Any]
-) -> list[tuple[str, dict[str, Any]]]:
-    """What defines the settings, weakest first: a source and the values it sets."""
+    preset: str | None, config: Path | None, flags: Mapping[str, Any]
+) -> tuple[str, list[Layer]]:
+    """Return the preset's name and what defines the settings, weakest first."""
+    file = [] if config is None else [_read_config(config)]
+    if preset is None:  # that of the plant
+        plant = flags.get("plant") or next((one.values.get("plant") for one in file), None)
+        preset = plant if plant in PRESETS else "default"
     if preset not in PRESETS:
         raise UsageError(f"unknown preset '{preset}'; choose one of {', '.join(PRESETS)}")
-    chosen = flags.get("protocol") or PROTOCOLS[0]
-    if chosen not in PROTOCOLS:
-        raise UsageError(f"unknown protocol {chosen!r}; choose one of {', '.join(PROTOCOLS)}")
-    layers = [("default", _read_preset("default"))]
+    protocol = flags.get("protocol") or PROTOCOLS[0]
+    if protocol not in PROTOCOLS:
+        raise UsageError(f"unknown protocol {protocol!r}; choose one of {', '.join(PROTOCOLS)}")
+    defaults = dataclasses.asdict(Settings())
+    del defaults["preset"]
+    layers, paper = [Layer("default", defaults)], [PAPER_PROTOCOL]
     if preset != "default":
-        layers.append((f"preset {preset}", _read_preset(preset)))
-    # What the presets set for the paper's protocol alone is a layer of its own.
-    paper = [values.get("protocol", {}).pop("paper", {}) for _, values in layers]
-    if chosen == "paper":
-        layers += [("protocol paper", {"protocol": values}) for values in paper]
-    if config is not None:
-        layers.append((str(config), _read_config(config)))
+        values = tomllib.loads((_FOLDER / f"{preset}.toml").read_text(encoding="utf-8"))
+        paper.append(values.get("protocol", {}).pop("paper", {}))
+        layers.append(Layer(f"preset {preset}", values))
+    if protocol == "paper":
+        layers += [Layer("protocol paper", {"protocol": values}) for values in paper]
+    layers += file
     for key, value in flags.items():
         if value is not None and key != "protocol":
             section, _, field = key.rpartition(".")
-            layers.append(("flag", {section: {field: value}} if section else {field: value}))
-    return layers
+            layers.append(Layer("flag", {section: {field: value}} if section else {key: value}))
+    return preset, layers
 
 
-def _read_preset(name: str) -> dict[str, Any]:
-    text = (resources.files("hjepa_cli.config") / "presets" / f"{name}.toml").read_text(
-        encoding="utf-8"
-    )
-    return tomllib.loads(text)
-
-
-def _read_config(path: Path) -> dict[str, Any]:
+def _read_config(path: Path) -> Layer:
     try:
         if path.stat().st_size > CONFIG_LIMIT_BYTES:
             raise DataError(f"config file {path} is larger than {CONFIG_LIMIT_BYTES} bytes")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        return Layer(str(path), tomllib.loads(text), text)
     except FileNotFoundError:
         raise MissingInputError(f"config file {path} does not exist") from None
     except RecursionError:
@@ -385,57 +153,43 @@ def _read_config(path: Path) -> dict[str, Any]:
         raise DataError(f"config file {path} is not readable TOML: {error}") from None
 
 
-def _override(values: dict[str, Any], changes: Mapping[str, Any], source: str) -> None:
-    """Write ``changes`` into ``values`` in place, refusing keys that default.toml does not have."""
-    for key, value in changes.items():
-        if key not in values:
-            near = difflib.get_close_matches(key, values, n=1)
+def _merge(
+    values: dict[str, Any], changes: Mapping[str, Any], layer: Layer, prefix: str = ""
+) -> None:
+    """Write changes into values in place; refuse keys that there are not, once there are some."""
+    if not values:
+        values |= changes
+        return
+    for name, value in changes.items():
+        key = prefix + name
+        if name not in values:
+            near = difflib.get_close_matches(name, values, n=1)
             suggestion = (
-                f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(values)}"
+                f"did you mean '{prefix}{near[0]}'?" if near else f"valid keys: {', '.join(values)}"
             )
-            raise UsageError(f"unknown setting '{key}' in {source}; {suggestion}")
-        if isinstance(values[key], dict):
-            if not isinstance(value, Mapping):
-                raise UsageError(f"'{key}' in {source} is a section, not a value")
-            _override(values[key], value, f"{source}, section [{key}]")
+            raise UsageError(f"unknown setting '{key}'{layer.place(key)}; {suggestion}")
+        inside = isinstance(values[name], dict)
+        if inside != isinstance(value, Mapping):
+            kind = "a section, not a value" if inside else "a value, not a section"
+            raise UsageError(f"'{key}'{layer.place(key)} is {kind}")
+        if inside:
+            _merge(values[name], value, layer, f"{key}.")
         else:
-            values[key] = value
+            values[name] = value
 
 
-def _build(kind: type[T], values: Mapping[str, Any], prefix: str) -> T:
-    """Instantiate a settings dataclass, checking the type of every value."""
-    hints = typing.get_type_hints(kind)
-    return kind(**{name: _convert(hints[name], values[name], prefix + name) for name in hints})
-
-
-NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-
-
-def _convert(hint: Any, value: Any, name: str) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type, hint), value, f"{name}.")
-    if typing.get_origin(hint) is Literal:
-        choices = typing.get_args(hint)
-        if value not in choices:
-            raise UsageError(f"{name} = {value!r}; choose one of {', '.join(choices)}")
-        return value
-    if typing.get_origin(hint) is tuple:
-        item = typing.get_args(hint)[0]
-        if not isinstance(value, list | tuple):
-            raise UsageError(f"{name} = {value!r}; expected a list")
-        return tuple(_convert(item, entry, name) for entry in value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value) if abs(value) <= sys.float_info.max else math.inf
-    if type(value) is not hint:
-        raise UsageError(f"{name} = {value!r}; expected {NAMES[hint]}")
-    if hint is float and not math.isfinite(value):
-        raise UsageError(f"{name} = {value}; expected a finite number")
-    return value
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items() if entry != ()}
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
-    return value
+def _line_of(text: str, key: str) -> int | None:
+    """Return the line that sets a key or opens its section; ``None`` where that is not certain."""
+    if '"""' in text or "'''" in text:  # lines in there may look like others
+        return None
+    section, found = "", []
+    for number, line in enumerate(text.split("\n"), start=1):
+        if header := re.match(r"\s*\[\s*([\w.-]+)\s*\]", line):
+            name, section = header[1], f"{header[1]}."
+        elif assigned := re.match(r"\s*([\w.-]+)\s*=", line):
+            name = section + assigned[1]
+        else:
+            continue
+        if name == key:
+            found.append(number)
+    return found[0] if len(found) == 1 else None

@@ -1,14 +1,14 @@
-"""Every number of the closed loop: scores, costs, control error, intervals, tolerances.
+"""Scores of the closed loop become ratios, intervals and tolerances here.
 
-Notation for shapes: N devices, P curve points, B bootstrap replicates. Intervals are percentile
-intervals of a bootstrap over devices; the same devices are drawn for a method and for its
-reference, so what both share (a hard start, a gust) cancels.
+There are N devices, P curve points and B bootstrap replicates. Intervals are percentile intervals
+of a bootstrap over devices; the same devices are drawn for a method and for its reference, so what
+both share (a hard start, a gust) cancels.
 """
 
 import math
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.core.arrays import Floats
@@ -19,7 +19,7 @@ _BOOTSTRAP_KEY = 0xB007
 
 
 def bootstrap_weights(samples: int, replicates: int, seed: int) -> Floats:
-    """How often each sample appears in each bootstrap replicate, ÷ samples: [B, N], rows sum to 1.
+    """Return each sample's share of each bootstrap replicate: [B, N], rows sum to 1.
 
     ``weights @ values`` is then the mean of every replicate.
     """
@@ -30,39 +30,32 @@ def bootstrap_weights(samples: int, replicates: int, seed: int) -> Floats:
 
 
 def interval(replicates: Floats) -> Floats:
-    """95 % percentile interval over the first axis: [B, ...] → [2, ...].
+    """Return the 95 % percentile interval [2, ...] over the first axis of [B, ...].
 
-    Takes order statistics as they are, so that infinite replicates (no crossing) stay infinite.
+    Order statistics are taken as they are, so that infinite replicates (no crossing) stay infinite.
     Undefined replicates (see :func:`ratio`) are left out.
     """
-    undefined = np.isnan(replicates)
-    if undefined.any():
-        return np.nanquantile(replicates, TAILS, axis=0, method="inverted_cdf")
-    return np.quantile(replicates, TAILS, axis=0, method="inverted_cdf")
+    quantile = np.nanquantile if np.isnan(replicates).any() else np.quantile  # the latter is faster
+    return quantile(replicates, TAILS, axis=0, method="inverted_cdf")
 
 
 def mean_interval(values: Floats, weights: Floats) -> Floats:
-    """Interval of the mean: values [N, ...], weights [B, N] → [2, ...]."""
+    """Return the interval [2, ...] of the mean of values [N, ...] with weights [B, N]."""
     return interval(np.tensordot(weights, values, axes=1))
 
 
 def student_interval(values: Floats) -> Floats:
-    """Student's 95 % interval of the mean over the first axis: [n, ...], n > 1 → [2, ...]."""
+    """Return Student's 95 % interval [2, ...] of the mean over axis 0 of [n, ...], n > 1."""
     count = len(values)
-    half = stats.t.ppf(TAILS[1], count - 1) * values.std(axis=0, ddof=1) / math.sqrt(count)
+    half = special.stdtrit(count - 1, TAILS[1]) * values.std(axis=0, ddof=1) / math.sqrt(count)
     return np.asarray(values.mean(axis=0) + np.multiply.outer((-1.0, 1.0), half))
 
 
 def ratio(values: Floats, reference: Floats, weights: Floats | None = None) -> Floats:
-    """Mean of a method ÷ mean of its reference on the same devices.
+    """Return the mean of values [..., N] ÷ the mean of a reference [N] on the same devices.
 
-    Args:
-        values: [..., N].
-        reference: [N].
-        weights: bootstrap weights [B, N]; ``None`` is the plain mean.
-
-    Returns:
-        [...], or [B, ...] with weights; there NaN in replicates that drew a reference of 0.
+    It is [...], or [B, ...] with bootstrap weights [B, N], and then NaN in replicates that drew a
+    reference of 0.
 
     Raises:
         NumericalError: the reference is 0.
@@ -76,7 +69,7 @@ def ratio(values: Floats, reference: Floats, weights: Floats | None = None) -> F
 
 
 def reference_mean(reference: Floats) -> float:
-    """The mean that scores are normalised by.
+    """Return the mean that scores are normalised by.
 
     Raises:
         NumericalError: it is 0, and a normalised score nothing.
@@ -91,13 +84,12 @@ def reference_mean(reference: Floats) -> float:
     return mean
 
 
-def first_crossing(gaps: Floats, scores: Floats, level: float, *, log: bool) -> Floats:
-    """Where each curve first falls below ``level``, interpolated between its points.
+def first_crossing(gaps: Floats, scores: Floats, acceptable: float, *, log: bool) -> Floats:
+    """Return where each curve first falls below ``acceptable``, interpolated between its points.
 
     Args:
         gaps: ascending mean gaps between packets [P], in steps.
         scores: [..., P]; an undefined one (NaN) is not acceptable.
-        level: 0.62 for scores.
         log: interpolate linearly in ln gap (= -ln p, delivery) instead of in the gap.
 
     Returns:
@@ -105,14 +97,14 @@ def first_crossing(gaps: Floats, scores: Floats, level: float, *, log: bool) -> 
     """
     x = np.log(gaps) if log else np.asarray(gaps, dtype=np.float64)
     scores = np.where(np.isnan(scores), -np.inf, scores)
-    below = scores < level
+    below = scores < acceptable
     right = np.argmax(below, axis=-1)
     left = np.maximum(right - 1, 0)
     y_left, y_right = (
         np.take_along_axis(scores, i[..., None], axis=-1)[..., 0] for i in (left, right)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = x[left] + (x[right] - x[left]) * (y_left - level) / (y_left - y_right)
+        crossing = x[left] + (x[right] - x[left]) * (y_left - acceptable) / (y_left - y_right)
     if log:
         crossing = np.exp(crossing)
     crossing = np.where(right == 0, -np.inf, crossing)

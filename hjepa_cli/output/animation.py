@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.plants.system import Camera, System
-from hjepa_cli.errors import MissingInputError, StorageError, UsageError
+from hjepa_cli.errors import StorageError, UsageError, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.pictures import FAINT, INK, PAPER, font
 from hjepa_cli.storage import files
@@ -40,14 +40,12 @@ class Pictures:
 
     Args:
         films: one per method, of the same devices and steps.
-        link: what the radio did to them.
-        kind: the plant.
-        camera: what looks at it.
+        link, kind, camera: the radio, the plant, and what looks at it.
         every: control steps between pictures.
     """
 
     def __init__(
-        self, films: "Sequence[Film]", link: Link, kind: System, camera: Camera, every: int
+        self, films: Sequence[Film], link: Link, kind: System, camera: Camera, every: int
     ) -> None:
         self.films, self.link, self.kind = films, link, kind
         self.every = every
@@ -65,7 +63,7 @@ class Pictures:
         return map(self.draw, self.steps)
 
     def draw(self, k: int) -> Image.Image:
-        """The picture of control step ``k``."""
+        """Draw the picture of control step ``k``."""
         picture = Image.new("RGB", self.size_px, PAPER)
         draw = ImageDraw.Draw(picture)
         clock = f"t = {1e3 * k * self.kind.step_s:.0f} ms   {self.link.label}"
@@ -81,29 +79,28 @@ class Pictures:
             draw.text((MARGIN_PX + NAME.getlength(shot.method) + 16, top + 2), said, FAINT, TEXT)
             for device in range(self.devices):
                 left = MARGIN_PX + device * (PANEL_PX[0] + MARGIN_PX)
-                panel = self._panel(shot, device, k)
-                picture.paste(panel, (left, top + TITLE_PX))
+                picture.paste(self._panel(shot, device, k), (left, top + TITLE_PX))
         return picture
 
     def age_steps(self, device: int, k: int) -> int:
-        """Steps since the last packet of a device arrived; 0 where one arrives at ``k``."""
+        """Return steps since the last packet of a device arrived; 0 where one arrives at ``k``."""
         return k - int(np.flatnonzero(self.link.delivered[: k + 1, device])[-1])
 
-    def frame(self, shot: Film, device: int, k: int) -> NDArray[np.uint8]:
-        """What the camera sees, uint8 [64, 128, 3]."""
+    def frame(self, shot: Film, device: int, k: int) -> Pixels:
+        """Return what the camera sees, uint8 [64, 128, 3]."""
         (frame,) = self._camera.render(shot.states[k, device][None])
         return frame
 
     def age_ms(self, device: int, k: int) -> float:
-        """The same in milliseconds."""
+        """Return the time since the last packet of a device arrived, in milliseconds."""
         return 1e3 * self.age_steps(device, k) * self.kind.step_s
 
-    def sketch(self, shot: Film, device: int, k: int) -> list[NDArray[np.float64]]:
-        """The believed state as lines over a frame, in its pixels."""
+    def sketch(self, shot: Film, device: int, k: int) -> list[Floats]:
+        """Return the believed state as lines over a frame, in its pixels."""
         return self._camera.sketch_px(shot.believed[k, device])
 
     def error(self, shot: Film, device: int, k: int) -> str:
-        """How far off the belief is in the first angle, else in the first state."""
+        """Say how far off the belief is in the first angle, else in the first state."""
         names, units = self.kind.state_names, self.kind.state_units
         which = units.index("rad") if "rad" in units else 0
         error = shot.believed[k, device, which] - shot.states[k, device, which]
@@ -124,8 +121,8 @@ class Pictures:
         self._draw_slots(draw, device, k, 16 + HEIGHT_PX * SCALE + 2, PANEL_PX[1] - 1)
         return panel
 
-    def _draw_belief(self, draw: ImageDraw.ImageDraw, sketch: list[NDArray[np.float64]]) -> None:
-        """The axis of the believed state as a dashed line, the rest of it as an outline."""
+    def _draw_belief(self, draw: ImageDraw.ImageDraw, sketch: list[Floats]) -> None:
+        """Draw the axis of the believed state as a dashed line, the rest of it as an outline."""
         (start, end), *outlines = (line * SCALE for line in sketch)
         for line in outlines:
             draw.line([tuple(point) for point in line], fill=(0, 0, 0))
@@ -139,7 +136,7 @@ class Pictures:
     def _draw_slots(
         self, draw: ImageDraw.ImageDraw, device: int, k: int, top: int, bottom: int
     ) -> None:
-        """The last slots, one column each, the newest at the right."""
+        """Draw the last slots, one column each, the newest at the right."""
         draw.rectangle([0, top, PANEL_PX[0] - 1, bottom], fill=(228, 228, 228))
         first = max(k + 1 - PANEL_PX[0], 0)
         for slot, arrived in enumerate(self.link.delivered[first : k + 1, device], start=first):
@@ -151,12 +148,7 @@ class Pictures:
 
 
 def check_target(path: Path, fps: int) -> None:
-    """Refuse a file that we could not write, before anything is simulated.
-
-    Raises:
-        UsageError: neither .gif nor .mp4, or more pictures per second than a GIF holds.
-        MissingInputError: MP4 without its library.
-    """
+    """Raise UsageError or MissingInputError for a file that we could not write, in good time."""
     if path.suffix not in FORMATS:
         raise UsageError(f"no animation format '{path.suffix}'; --out FILE.gif or FILE.mp4")
     if path.suffix == ".gif" and fps > MOST_GIF_FPS:
@@ -165,17 +157,11 @@ def check_target(path: Path, fps: int) -> None:
             hint=f"--fps {MOST_GIF_FPS}, or --out FILE.mp4",
         )
     if path.suffix == ".mp4":
-        try:
-            import imageio_ffmpeg  # noqa: F401 - only whether it is there
-        except ModuleNotFoundError:
-            raise MissingInputError(
-                "MP4 needs imageio-ffmpeg, which is not installed",
-                hint='pip install "hjepa[video]", or --out FILE.gif',
-            ) from None
+        require("imageio_ffmpeg", "MP4 needs imageio-ffmpeg", "video", ", or --out FILE.gif")
 
 
 def true_fps(path: Path, fps: int) -> float:
-    """Pictures per second that the file holds."""
+    """Return how many pictures per second the file holds."""
     return 1000 / _gif_ms(fps) if path.suffix == ".gif" else fps
 
 
@@ -199,12 +185,12 @@ def _gif(pictures: Pictures, fps: int, tick: Callable[[], None]) -> bytes:
 
 
 def _gif_ms(fps: int) -> int:
-    """How long a GIF shows a picture: whole hundredths of a second."""
+    """Return how long a GIF shows a picture: whole hundredths of a second."""
     return 10 * round(100 / fps)
 
 
 def _palette(picture: Image.Image) -> Image.Image:
-    """The commonest colours of a picture, and for certain those of the strips, however rare."""
+    """Return the commonest colours of a picture, and those of the strips however rare."""
     kept = (*ARRIVED, *LOST)
     common = picture.quantize(COLOURS - len(kept) // 3).getpalette() or []
     palette = Image.new("P", (1, 1))

@@ -1,202 +1,126 @@
-"""Figures for papers: one column wide (3.5 in), readable in black and white, equal byte for byte.
+"""Figures for papers: one column wide or two, readable in black and white, equal byte for byte.
 
 This is the only module that imports matplotlib (extra ``plot``). Figures are built without pyplot,
 so no display, backend or global state is involved.
 """
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import ArrayLike
 
+from hjepa_cli.core.style import PLAIN, Style
 from hjepa_cli.errors import UsageError
+from hjepa_cli.plugins import LAWS, METHODS, SCHEDULERS
 from hjepa_cli.storage.files import write_bytes
 
-WIDTH_IN = 3.5  # an IEEE column
+WIDTH_IN, TWO_COLUMNS_IN = 3.5, (7.16, 3.0)  # of an IEEE page
 DPI = 300
 MARKERS = 8  # per line at most
 ZERO_ERROR = 1e-5  # NMAE below which a method plays what the teacher plays
 RC: dict[Any, Any] = {
-    "font.size": 8,
-    "axes.labelsize": 8,
-    "axes.titlesize": 7,
-    "legend.fontsize": 7,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
+    **dict.fromkeys(("font.size", "axes.labelsize"), 8),
+    **dict.fromkeys(("axes.titlesize", "legend.fontsize", "xtick.labelsize", "ytick.labelsize"), 7),
+    "legend.frameon": False,
+    "legend.handlelength": 2.4,
     "axes.linewidth": 0.6,
     "grid.linewidth": 0.4,
     "grid.alpha": 0.5,
     "lines.linewidth": 1.1,
     "pdf.fonttype": 42,  # TrueType: IEEE refuses Type 3
-    "ps.fonttype": 42,
     "svg.hashsalt": "hjepa",  # element ids depend on the content only
 }
 # Dates would make two runs differ.
-METADATA: dict[str, dict[str, Any]] = {
-    "png": {},
-    "svg": {"Date": None},
-    "pdf": {"CreationDate": None},
-}
+METADATA: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+THOUSANDS = FuncFormatter(lambda value, _: f"{value:,.0f}")
 
+Entries = Mapping[str, Mapping[str, Any]]
+"""Entries of ``eval --json`` by method."""
 
-@dataclass(frozen=True)
-class Style:
-    """How one method is drawn everywhere. Hollow markers: controllers that see the true state.
-
-    Curves of equally good methods lie on each other. So solid lines with large markers are drawn
-    first, dashed ones with smaller markers over them, and all stay visible.
-    """
-
-    colour: str  # Okabe and Ito's palette, safe for colour-blind readers
-    marker: str
-    line: Any = "-"
-    hollow: bool = False
-    size: float = 4.0  # of the marker, in points
-
-    def looks(self, scale: float = 1.0) -> dict[str, Any]:
-        """What ``Axes.plot`` takes."""
-        return {
-            "color": self.colour,
-            "linestyle": self.line,
-            "marker": self.marker,
-            "markersize": scale * self.size,
-            "markerfacecolor": "none" if self.hollow else self.colour,
-            "markeredgecolor": self.colour if self.hollow else "white",
-            "markeredgewidth": 1.0 if self.hollow else 0.4,
-            "zorder": 3.0 - 0.1 * self.size,
-        }
-
-
-DASH_DOT_DOT = (0, (3, 1, 1, 1, 1, 1))
-STYLES = {
-    "hjepa": Style("#0072B2", "o", size=7.0),
-    "ts-jepa-1": Style("#D55E00", "s", "--", size=2.8),
-    "ts-jepa-4": Style("#009E73", "^", "-.", size=5.0),
-    "hold": Style("#CC79A7", "v", ":"),
-    "zero": Style("#E69F00", "D", DASH_DOT_DOT, size=3.5),
-    "oracle": Style("#000000", "o", "-", hollow=True, size=8.5),
-    "hold-true": Style("#7F7F7F", "v", ":", hollow=True, size=6.5),
-    "zero-true": Style("#7F7F7F", "D", DASH_DOT_DOT, hollow=True, size=6.5),
-    "ts-jepa-2": Style("#56B4E9", "<", "--"),
-    "ts-jepa-3": Style("#56B4E9", ">", "-."),
-    "ts-jepa-5": Style("#56B4E9", "p", ":"),
-    "supervised-2": Style("#882255", "P", "--"),
-    "supervised-4": Style("#882255", "X", "-."),
-    "autoencoder-2": Style("#999933", "h", "--"),
-    "hold-decay": Style("#CC79A7", "^", "-.", hollow=True, size=5.0),
-    "hold-decay-linear": Style("#CC79A7", ">", "--", hollow=True, size=5.0),
-    "chunk": Style("#117733", "X", "--", hollow=True, size=5.0),
-    "chunk-forces": Style("#117733", "P", "-.", hollow=True, size=5.0),
-    "linear": Style("#44AA99", "d", "--"),
-    "state-kf": Style("#332288", "*", "--", size=5.5),
-    "state-48": Style("#332288", "8", "-."),
-    "local": Style("#000000", "s", ":", hollow=True, size=6.5),
-    "optimal": Style("#000000", "x", ":"),
-}
 OTHERS = [Style("#7F7F7F", marker, ":") for marker in "<>phd*PX"]
+LINES = (  # of a training, whose losses are drawn like these
+    *("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero", "oracle", "hold-true", "zero-true"),
+    *("ts-jepa-2", "ts-jepa-3", "ts-jepa-5", "supervised-2", "supervised-4", "autoencoder-2"),
+)
 LONGEST_OF_THREE = 15  # characters of a label, for three columns of a legend
-
-SCHEDULER_STYLES = {
-    "round-robin": Style("#7F7F7F", "s", ":", hollow=True),
-    "opportunistic": Style("#E69F00", "D", DASH_DOT_DOT, hollow=True),
-    "max-aoi": Style("#009E73", "^", "-."),
-    "drift-plus-penalty": Style("#CC79A7", "v", "--", hollow=True),
-    "whittle": Style("#D55E00", "s", "--"),
-    "innovation": Style("#0072B2", "o"),
-}
 
 
 def scale_figure(result: Mapping[str, Any], *, title: str = "") -> Figure:
-    """Draw what ``scale --json`` counted, as fits its law."""
-    if result["law"] == "scheduled":
+    """Draw the counts of ``scale --json``: by scheduler where there are some, else by method."""
+    if any("scheduler" in row for row in result["rows"]):
         return schedulers_figure(result["rows"], title=title)
-    snr_label = "Target SNR (dB)" if result["law"] == "duty" else "Mean SNR (dB)"
+    law = result["law"]  # of a plugin, perhaps, that was in force there and is not here
+    snr_label = LAWS[law].snr_label if law in LAWS else "SNR (dB)"
     return devices_figure(result["rows"], title=title, snr_label=snr_label)
 
 
+@matplotlib.rc_context(RC)
 def devices_figure(
     rows: Sequence[Mapping[str, Any]], *, title: str = "", snr_label: str = "Target SNR (dB)"
 ) -> Figure:
     """Draw supported devices against the SNR, one line per method, as the paper's Fig. 4.
 
-    Args:
-        rows: of ``scale --json``: ``snr_db``, ``method``, ``devices``, ``devices_ci95``. Methods
-            that support nobody anywhere are named in the legend only; ``at_least`` is, too.
-        title: one line above the axes.
-        snr_label: what the SNR is under the law.
+    The rows, of ``scale --json``, have ``snr_db``, ``method``, ``devices`` and ``devices_ci95``.
+    Methods that support nobody anywhere are named in the legend only; ``at_least`` is, too.
     """
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
-        axes = figure.add_subplot()
-        curves = _curves(rows)
-        bounds = {row["method"] for row in rows if row.get("at_least")}
-        for method, points in sorted(curves.items(), key=lambda item: -item[1][-1, 1]):
-            label = method if points[:, 1].any() else f"{method} (0)"
-            label += " (at least)" if method in bounds else ""
-            _draw(axes, label, points, method_style(method, list(curves)))
-        _scale_counts(axes, [row for row in rows if row["devices"]])
-        axes.set_xlabel(snr_label)
-        axes.set_ylabel("Supported devices")
-        axes.set_title(title)
-        grid_db = sorted({row["snr_db"] for row in rows})
-        if len(grid_db) <= MARKERS:
-            axes.set_xticks(grid_db)
-        axes.grid(visible=True)
-        _legend(figure, axes)
-        return figure
+    figure, axes = _panel()
+    curves = _curves(rows)
+    bounds = {row["method"] for row in rows if row.get("at_least")}
+    for method, points in sorted(curves.items(), key=lambda item: -item[1][-1, 1]):
+        snr_db, devices = points[:, 0], points[:, 1]
+        label = method if devices.any() else f"{method} (0)"
+        label += " (at least)" if method in bounds else ""
+        seen = np.where(devices > 0, devices, np.nan)
+        draw_line(axes, method, list(curves), snr_db, seen, points[:, 2:], label, scale=1.0)
+    _scale_counts(axes, [row for row in rows if row["devices"]])
+    axes.set_xlabel(snr_label)
+    axes.set_ylabel("Supported devices")
+    _snr_ticks(axes, rows)
+    axes.set_title(title)
+    _finish(figure, axes)
+    return figure
 
 
+@matplotlib.rc_context(RC)
 def schedulers_figure(rows: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
-    """Draw supported devices against the SNR under each scheduler: a panel per method.
+    """Draw rows of ``scale --law scheduled --json``: devices against the SNR, a panel per method.
 
     Schedulers lie side by side at each SNR, so that intervals of equally good ones stay apart.
-
-    Args:
-        rows: of ``scale --law scheduled --json``.
-        title: one line above the panels.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    schedulers = [name for name in SCHEDULER_STYLES if name in {row["scheduler"] for row in rows}]
-    grid_db = sorted({row["snr_db"] for row in rows})
-    apart_db = 0.06 * min(np.diff(grid_db), default=1.0)
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(WIDTH_IN, 0.9 + 1.5 * len(methods)), layout="constrained")
-        panels = figure.subplots(len(methods), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, method in zip(panels, methods, strict=True):
-            for place, scheduler in enumerate(schedulers):
-                mine = [
-                    {
-                        **row,
-                        "snr_db": row["snr_db"] + apart_db * (place - len(schedulers) / 2 + 0.5),
-                    }
-                    for row in rows
-                    if (row["method"], row["scheduler"]) == (method, scheduler)
-                ]
-                _bars(axes, scheduler, _curves(mine)[method], SCHEDULER_STYLES[scheduler])
-            most = max(row["devices_ci95"][1] for row in rows if row["method"] == method)
-            axes.set_ylim(0, 1.1 * most or 1)  # the highest interval ends below the frame
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-            axes.set_ylabel("Devices")
-            axes.annotate(
-                method, (0.02, 0.96), xycoords="axes fraction", va="top", fontweight="bold"
-            )
-            axes.grid(visible=True, axis="y")
-        panels[0].set_title(title)
-        panels[-1].set_xlabel("Target SNR (dB)")
-        if len(grid_db) <= MARKERS:
-            panels[-1].set_xticks(grid_db)
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="outside lower center", ncols=2, frameon=False, handlelength=2.4
-        )
-        return figure
+    drawn = dict.fromkeys(row["scheduler"] for row in rows)
+    schedulers = sorted(drawn, key=lambda name: [*SCHEDULERS, *drawn].index(name))
+    apart_db = 0.06 * min(np.diff(sorted({row["snr_db"] for row in rows})), default=1.0)
+    figure, panels = _panels(len(methods), 0.9 + 1.5 * len(methods))
+    for axes, method in zip(panels, methods, strict=True):
+        for place, scheduler in enumerate(schedulers):
+            mine = [r for r in rows if (r["method"], r["scheduler"]) == (method, scheduler)]
+            snr_db, *devices = _curves(mine)[method].T
+            snr_db = snr_db + apart_db * (place - len(schedulers) / 2 + 0.5)
+            style = SCHEDULERS[scheduler].style if scheduler in SCHEDULERS else PLAIN
+            looks = {"linestyle": style.line, "linewidth": 0.7, "capsize": 1.5}
+            draw_bars(axes, style, snr_db, *devices, label=scheduler, **looks)
+        most = max(row["devices_ci95"][1] for row in rows if row["method"] == method)
+        axes.set_ylim(0, 1.1 * most or 1)  # the highest interval ends below the frame
+        axes.yaxis.set_major_formatter(THOUSANDS)
+        axes.set_ylabel("Devices")
+        axes.annotate(method, (0.02, 0.96), xycoords="axes fraction", va="top", fontweight="bold")
+        axes.grid(visible=True, axis="y")
+    panels[0].set_title(title)
+    panels[-1].set_xlabel("Target SNR (dB)")
+    _snr_ticks(panels[-1], rows)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -209,20 +133,20 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def has_curves(figure: Figure) -> bool:
-    """Whether anything is drawn that a legend would name."""
+    """Return whether anything is drawn that a legend would name."""
     return any(axes.get_legend_handles_labels()[1] for axes in figure.axes)
 
 
+@matplotlib.rc_context(RC)
 def encoded(figure: Figure, kind: str) -> bytes:
-    """A figure as ``"png"``, ``"svg"`` or ``"pdf"``."""
+    """Return a figure as ``"png"``, ``"svg"`` or ``"pdf"``."""
     buffer = io.BytesIO()
-    with matplotlib.rc_context(RC):
-        figure.savefig(buffer, format=kind, dpi=DPI, metadata=METADATA[kind])
+    figure.savefig(buffer, format=kind, dpi=DPI, metadata=METADATA[kind])
     return buffer.getvalue()
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Rows by method as arrays [points, (snr, devices, low, high)], ascending in SNR."""
+    """Return rows by method as arrays [points, (snr, devices, low, high)], ascending in SNR."""
     curves: dict[str, list[list[float]]] = {}
     for row in rows:
         if row["devices"] is not None:
@@ -232,47 +156,14 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 
 
 def method_style(method: str, methods: list[str]) -> Style:
-    """How a method is drawn; ``methods`` are all of the figure, so that none shares a marker."""
-    others = [name for name in methods if name not in STYLES]
-    return STYLES.get(method) or OTHERS[others.index(method) % len(OTHERS)]
-
-
-def _draw(axes: Axes, label: str, points: np.ndarray, style: Style) -> None:
-    snr_db, devices, low, high = points.T
-    axes.plot(
-        snr_db,
-        np.where(devices > 0, devices, np.nan),
-        markevery=-(-len(points) // MARKERS),
-        label=label,
-        **style.looks(),
-    )
-    if len(points) > 1:
-        axes.fill_between(snr_db, low, high, color=style.colour, alpha=0.18, linewidth=0)
-    else:
-        axes.vlines(snr_db, low, high, color=style.colour)
-
-
-def _bars(axes: Axes, label: str, points: np.ndarray, style: Style) -> None:
-    """A line through counts with their intervals as bars [points, (snr, devices, low, high)]."""
-    snr_db, devices, low, high = points.T
-    axes.errorbar(
-        snr_db,
-        devices,
-        yerr=np.maximum([devices - low, high - devices], 0),
-        color=style.colour,
-        linestyle=style.line,
-        linewidth=0.7,
-        marker=style.marker,
-        markerfacecolor="white" if style.hollow else style.colour,
-        markersize=3.5,
-        elinewidth=0.9,
-        capsize=1.5,
-        label=label,
-    )
+    """Return how a method is drawn; ``methods`` are all of the figure: none shares a marker."""
+    own = {name: METHODS[name].style for name in methods if name in METHODS}
+    others = [name for name in methods if not own.get(name)]
+    return own.get(method) or OTHERS[others.index(method) % len(OTHERS)]
 
 
 def _scale_counts(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Logarithmic where methods lie more than a decade apart at one SNR, else from zero."""
+    """Set a logarithmic axis where methods lie over a decade apart at one SNR, else from zero."""
     at: dict[float, list[int]] = {}
     for row in rows:
         at.setdefault(row["snr_db"], []).append(row["devices"])
@@ -285,132 +176,75 @@ def _scale_counts(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
         axes.yaxis.set_minor_formatter(NullFormatter())
     else:
         axes.set_ylim(0, 1.1 * most)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+    axes.yaxis.set_major_formatter(THOUSANDS)
 
 
-def score_figure(
-    entries: Mapping[str, Mapping[str, Any]],
-    kind: str,
-    *,
-    acceptable_score: float,
-    step_s: float,
-    title: str = "",
-) -> Figure:
+@matplotlib.rc_context(RC)
+def score_figure(entries: Entries, kind: str, *, acceptable_score: float, step_s: float) -> Figure:
     """Draw the normalised score against the link, one line per method with its 95 % band.
 
-    Args:
-        entries: of ``eval --json``, by method: ``gap_curve`` or ``delivery_curve``.
-        kind: ``"gap"``: against the time between packets; ``"delivery"``: against p.
-        acceptable_score: drawn as a level.
-        step_s: length of a control step, for the time axis.
-        title: one line above the axes.
+    The link is the time between packets (``kind`` ``"gap"``) or p (``"delivery"``).
     """
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
-        axes = figure.add_subplot()
-        axes.axhline(acceptable_score, color="black", linewidth=0.6, linestyle=(0, (6, 3)))
-        axes.annotate(
-            f"acceptable: {acceptable_score:g}",
-            (0.01, acceptable_score),
-            xycoords=("axes fraction", "data"),
-            xytext=(2, 2),
-            textcoords="offset points",
-            fontsize=6,
-        )
-        for method, entry in entries.items():
-            curve = entry[f"{kind}_curve"]
-            if len(curve) < 2 or entry["tolerance_gap_steps"] is None:
-                continue  # a method without a link (optimal) is a line at 1
-            where = [1e3 * step_s * point["d"] if kind == "gap" else point["p"] for point in curve]
-            band = np.array([point["ci95"] for point in curve], float)
-            scores = np.array([point["score"] for point in curve], float)
-            draw_line(axes, method, list(entries), np.array(where), scores, band)
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        if kind == "gap":
-            axes.set_xlabel("Time between packets (ms)")
-        else:
-            axes.set_xlabel("Delivery probability of a slot")
-            axes.invert_xaxis()
-        axes.set_ylabel("Normalised control score")
-        axes.set_ylim(bottom=0)
-        _finish(figure, axes, title)
-        return figure
+    figure, axes = _panel()
+    where = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    text, point = f"acceptable: {acceptable_score:g}", (0.01, acceptable_score)
+    axes.annotate(text, point, xytext=(2, 2), fontsize=6, **where)
+    draw_scores(axes, entries, kind, acceptable_score, step_s)
+    if kind == "delivery":
+        axes.set_xlabel("Delivery probability of a slot")
+        axes.invert_xaxis()
+    axes.set_ylabel("Normalised control score")
+    axes.set_ylim(bottom=0)
+    _finish(figure, axes)
+    return figure
 
 
-def error_figure(
-    entries: Mapping[str, Mapping[str, Any]], *, step_s: float, title: str = ""
-) -> Figure:
-    """Draw the NMAE after a single packet against the time since it, with 95 % bands.
-
-    Args:
-        entries: of ``eval --json``, by method: ``nmae`` and ``nmae_ci95`` over the horizon.
-        step_s: length of a control step.
-        title: one line above the axes.
-    """
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
-        axes = figure.add_subplot()
-        for method, entry in entries.items():
-            errors = np.array(entry["nmae"], float)
-            if errors.max() < ZERO_ERROR:
-                continue  # oracle and optimal know the noise-free future but for rounding
-            band = np.array(entry["nmae_ci95"], float)
-            draw_line(
-                axes, method, list(entries), 1e3 * step_s * np.arange(len(errors)), errors, band
-            )
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        shown = np.concatenate([line.get_ydata() for line in axes.lines] or [np.ones(1)])
-        axes.set_ylim(bottom=0.5 * shown[shown > ZERO_ERROR].min())
-        axes.set_xlabel("Time since the only packet (ms)")
-        axes.set_ylabel("NMAE of the force")
-        _finish(figure, axes, title)
-        return figure
+@matplotlib.rc_context(RC)
+def error_figure(entries: Entries, *, step_s: float) -> Figure:
+    """Draw the NMAE after a single packet against the time since it, with 95 % bands."""
+    figure, axes = _panel()
+    draw_errors(axes, entries, step_s)
+    shown = np.concatenate([line.get_ydata() for line in axes.lines] or [np.ones(1)])
+    axes.set_ylim(bottom=0.5 * shown[shown > ZERO_ERROR].min())
+    axes.set_xlabel("Time since the only packet (ms)")
+    axes.set_ylabel("NMAE of the force")
+    _finish(figure, axes)
+    return figure
 
 
-def training_figure(rows: Sequence[Mapping[str, str]], *, title: str = "") -> Figure:
+@matplotlib.rc_context(RC)
+def training_figure(rows: Sequence[Mapping[str, str]]) -> Figure:
     """Draw a training run's ``metrics.csv``: losses, and health where it was measured.
 
-    Args:
-        rows: as :class:`csv.DictReader` gives them, with ``step`` and either ``loss_…`` and
-            ``probe_r2_…`` columns, or ``level`` and ``loss``.
-        title: one line above the axes.
+    The rows, as :class:`csv.DictReader` gives them, have ``step`` and either ``loss_…`` and
+    ``probe_r2_…``, or ``level`` and ``loss``.
     """
-    losses = _series(rows, "loss")
-    health = _series(rows, "probe_r2")
-    with matplotlib.rc_context(RC):
-        count = 1 + bool(health)
-        figure = Figure(figsize=(WIDTH_IN, 1.2 + 1.4 * count), layout="constrained")
-        panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-        for axes, lines, label in zip(panels, (losses, health), ("Loss", "Probe R²"), strict=False):
-            for number, (name, points) in enumerate(lines.items()):
-                style = list(STYLES.values())[number % len(STYLES)]
-                axes.plot(
-                    *np.array(points).T,
-                    color=style.colour,
-                    linestyle=style.line,
-                    marker=style.marker,
-                    markerfacecolor="none",
-                    markersize=4,
-                    markevery=max(-(-len(points) // MARKERS), 1),
-                    label=name,
-                )
-            axes.set_ylabel(label)
-            axes.grid(visible=True)
-            axes.legend(fontsize=6, ncols=2, frameon=False, handlelength=2.4)
-        if all(value > 0 for points in losses.values() for _, value in points):
-            panels[0].set_yscale("log")
-        panels[0].set_title(title)
-        panels[-1].set_xlabel("Training step")
-        return figure
+    losses, health = _series(rows, "loss"), _series(rows, "probe_r2")
+    figure, panels = _panels(1 + bool(health), 2.6 + 1.4 * bool(health))
+    for axes, lines, label in zip(panels, (losses, health), ("Loss", "Probe R²"), strict=False):
+        for like, (name, points) in zip(itertools.cycle(LINES), lines.items()):
+            style = METHODS[like].style
+            axes.plot(
+                *np.array(points).T,
+                color=style.colour,
+                linestyle=style.line,
+                marker=style.marker,
+                markerfacecolor="none",
+                markersize=4,
+                markevery=_every(points),
+                label=name,
+            )
+        axes.set_ylabel(label)
+        axes.grid(visible=True)
+        axes.legend(fontsize=6, ncols=2)
+    if all(value > 0 for points in losses.values() for _, value in points):
+        panels[0].set_yscale("log")
+    panels[-1].set_xlabel("Training step")
+    return figure
 
 
 def _series(rows: Sequence[Mapping[str, str]], prefix: str) -> dict[str, list[tuple[float, float]]]:
-    """Columns of ``metrics.csv`` by name without their prefix; by level where there are levels."""
+    """Return columns of ``metrics.csv`` by name without prefix; by level, if there are any."""
     series: dict[str, list[tuple[float, float]]] = {}
     for row in rows:
         for column, text in row.items():
@@ -420,32 +254,179 @@ def _series(rows: Sequence[Mapping[str, str]], prefix: str) -> dict[str, list[tu
     return series
 
 
+def draw_scores(
+    axes: Axes, entries: Entries, kind: str, acceptable_score: float, step_s: float
+) -> None:
+    """Draw the scores of all methods with a link; see :func:`score_figure`."""
+    axes.axhline(acceptable_score, color="black", linewidth=0.6, linestyle=(0, (6, 3)))
+    for method, entry in entries.items():
+        curve = entry[f"{kind}_curve"]
+        if len(curve) < 2 or entry["tolerance_gap_steps"] is None:
+            continue  # a method without a link (optimal) is a line at its score
+        where = [1e3 * step_s * point["d"] if kind == "gap" else point["p"] for point in curve]
+        scores, band = ([point[key] for point in curve] for key in ("score", "ci95"))
+        draw_line(axes, method, list(entries), where, scores, band)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    plain_ticks(axes.xaxis)
+    axes.set_xlabel("Time between packets (ms)")
+
+
+def draw_errors(axes: Axes, entries: Entries, step_s: float) -> None:
+    """Draw the NMAE of all methods that make an error; see :func:`error_figure`."""
+    for method, entry in entries.items():
+        if max(entry["nmae"]) > ZERO_ERROR:  # not oracle and optimal, which know the future
+            time_ms = 1e3 * step_s * np.arange(len(entry["nmae"]))
+            draw_line(axes, method, list(entries), time_ms, entry["nmae"], entry["nmae_ci95"])
+    axes.set_yscale("log")
+    plain_ticks(axes.yaxis)
+
+
 def draw_line(
-    axes: Axes, method: str, methods: list[str], where: np.ndarray, value: np.ndarray,
-    band: np.ndarray,
+    axes: Axes, method: str, methods: list[str], where: ArrayLike, value: ArrayLike,
+    band: ArrayLike, label: str | None = None, scale: float = 0.9,
 ) -> None:  # fmt: skip
     """Draw one method's line, markers and 95 % band [points, 2] over ``where``."""
     style = method_style(method, methods)
-    axes.plot(
+    where, value, band = (np.array(values, float) for values in (where, value, band))
+    every, looks = _every(where), style.looks(scale)
+    axes.plot(where, value, markevery=every, label=label or method, **looks)
+    if len(where) > 1:
+        axes.fill_between(where, *band.T, color=style.colour, alpha=0.18, linewidth=0)
+    else:
+        axes.vlines(where, *band.T, color=style.colour)
+
+
+def draw_bars(
+    axes: Axes, style: Style, where: Any, value: Any, low: Any, high: Any, **looks: Any
+) -> None:
+    """Draw marks with their intervals as bars."""
+    axes.errorbar(
         where,
         value,
-        markevery=-(-len(where) // MARKERS),
-        label=method,
-        **style.looks(0.9),
+        yerr=np.maximum([np.subtract(value, low), np.subtract(high, value)], 0),
+        color=style.colour,
+        marker=style.marker,
+        markerfacecolor="white" if style.hollow else style.colour,
+        markersize=3.5,
+        elinewidth=0.9,
+        **looks,
     )
-    axes.fill_between(where, band[:, 0], band[:, 1], color=style.colour, alpha=0.18, linewidth=0)
 
 
-def _finish(figure: Figure, axes: Axes, title: str) -> None:
-    axes.set_title(title)
+def plain_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers, its minor ticks with none."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _every(points: Sized) -> int:
+    """Return how many points share a marker."""
+    return max(-(-len(points) // MARKERS), 1)
+
+
+def _panel() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _panels(count: int, height_in: float) -> tuple[Figure, Sequence[Axes]]:
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    return figure, figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+
+
+def _snr_ticks(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    grid_db = sorted({row["snr_db"] for row in rows})
+    if len(grid_db) <= MARKERS:
+        axes.set_xticks(grid_db)
+
+
+def _finish(figure: Figure, axes: Axes) -> None:
+    """Add grid and a legend of as many columns as a paper's column has room for."""
     axes.grid(visible=True)
-    _legend(figure, axes)
+    if has_curves(figure):
+        longest = max(len(label) for label in axes.get_legend_handles_labels()[1])
+        ncols = 3 if longest <= LONGEST_OF_THREE else 2
+        figure.legend(loc="outside lower center", ncols=ncols)
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
-    """Below the axes, in as many columns as the column of a paper has room for."""
-    if not has_curves(figure):
-        return
-    longest = max(len(label) for label in axes.get_legend_handles_labels()[1])
-    ncols = 3 if longest <= LONGEST_OF_THREE else 2
-    figure.legend(loc="outside lower center", ncols=ncols, frameon=False, handlelength=2.4)
+@matplotlib.rc_context(RC)
+def comparison_figure(
+    entries: Entries, *, acceptable_score: float, step_s: float, title: str = ""
+) -> Figure:
+    """Draw the paper's Fig. 3: (a) NMAE, (b) bits per transmission, (c) score, with 95 % intervals.
+
+    In (a) and (c) the narrow panel on the left is the case without prediction, a packet at every
+    step; the wide one shows what happens when packets are few.
+    """
+    figure = Figure(figsize=TWO_COLUMNS_IN, layout="constrained")
+    figure.suptitle(title, fontsize=RC["axes.titlesize"])
+    error, bits, score = figure.subfigures(1, 3, width_ratios=(3, 1.5, 3))
+    _error_panels(error, entries, step_s)
+    _bits_panel(bits, entries)
+    _score_panels(score, entries, step_s, acceptable_score)
+    lines: dict[str, Any] = {}
+    for axes in figure.axes:
+        lines |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    shown = {name: lines[name] for name in entries if name in lines}
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=7)
+    return figure
+
+
+def _error_panels(figure: SubFigure, entries: Entries, step_s: float) -> None:
+    """Draw (a): control error with a packet at every step, and over the time since the only one."""
+    at_once, later = _pair(figure)
+    shown = {name: entry for name, entry in entries.items() if max(entry["nmae"]) > ZERO_ERROR}
+    _points(at_once, shown, list(entries), "nmae_every_step")
+    draw_errors(later, entries, step_s)
+    at_once.set_ylabel("NMAE of the force")
+    later.set_xlabel("Time since the packet (ms)")
+    later.set_title("(a) control error")
+
+
+def _bits_panel(figure: SubFigure, entries: Entries) -> None:
+    """Draw (b): what a transmission costs."""
+    axes = figure.subplots()
+    bits = {name: entry["bits_per_transmission"] for name, entry in entries.items()}
+    sending = {name: sent for name, sent in bits.items() if sent}
+    names = list(sending)[::-1]
+    colours = [method_style(name, list(entries)).colour for name in names]
+    axes.barh(names, [sending[name] for name in names], color=colours, height=0.7)
+    axes.set_xscale("log")
+    axes.set_xlim(left=10)
+    axes.tick_params(axis="y", length=0, labelsize=6)
+    axes.xaxis.set_major_locator(LogLocator(numticks=4))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel("Bits per transmission")
+    axes.set_title("(b) communication cost")
+    axes.grid(visible=True, axis="x")
+
+
+def _score_panels(figure: SubFigure, entries: Entries, step_s: float, acceptable: float) -> None:
+    """Draw (c): normalised control score with a packet at every step, and against the gap."""
+    at_once, later = _pair(figure)
+    _points(at_once, entries, list(entries), "score")
+    at_once.axhline(acceptable, color="black", linewidth=0.6, linestyle=(0, (6, 3)))
+    draw_scores(later, entries, "gap", acceptable, step_s)
+    at_once.set_ylim(bottom=0)
+    at_once.set_ylabel("Normalised control score")
+    later.tick_params(axis="x", labelsize=6)
+    later.set_title("(c) control score")
+
+
+def _pair(figure: SubFigure) -> tuple[Axes, Axes]:
+    """Return a narrow panel for packets at every step beside a wide one, with one vertical axis."""
+    at_once, later = figure.subplots(1, 2, sharey=True, width_ratios=(1, 2.6))
+    at_once.set_xticks([])
+    at_once.set_xlabel("packet at\nevery step")
+    for axes in (at_once, later):
+        axes.grid(visible=True)
+    return at_once, later
+
+
+def _points(axes: Axes, entries: Entries, methods: list[str], value: str) -> None:
+    """Draw one mark with its 95 % interval per method that has the value, side by side."""
+    for place, (name, entry) in enumerate(entries.items()):
+        if value in entry:  # else measured by a version that did not take it
+            marks = [entry[value]], *np.reshape(entry[f"{value}_ci95"], (2, 1))
+            draw_bars(axes, method_style(name, methods), [place], *marks)

@@ -1,11 +1,10 @@
 """Animations of closed loops in the terminal: pictures of two pixels a character, with rich.
 
-What :mod:`hjepa_cli.output.animation` draws, coarser: the true cart-pole in its colours, over it the pole
-that the controller believes in (black), and a strip with one character per picture.
+What :mod:`hjepa_cli.output.animation` draws, coarser: the true plant in its colours, over it the
+pole that the controller believes in (black), and a strip with one character per picture.
 """
 
 import time
-from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -32,7 +31,7 @@ def play(pictures: Pictures, fps: int) -> None:
 
 
 def terminal_picture(pictures: Pictures, k: int, width: int, height: int) -> Group:
-    """One picture as rich text and tables for a terminal of so many characters."""
+    """Return one picture as rich text and tables for a terminal of so many characters."""
     columns = panel_columns(pictures, width, height)
     nothing = "none did" if pictures.link.sends_always else "none sent"
     parts: list[Text | Table] = [
@@ -54,7 +53,7 @@ def terminal_picture(pictures: Pictures, k: int, width: int, height: int) -> Gro
 
 
 def panel_columns(pictures: Pictures, width: int, height: int) -> int:
-    """How wide a panel can be, so that all of them fit; small terminals cut some off."""
+    """Return how wide a panel can be, so that all of them fit; small terminals cut some off."""
     least, most = COLUMNS
     across = (width + GAP) // pictures.devices - GAP
     rows = (height - 3) // len(pictures.films) - 4  # the notes; a title and three lines of captions
@@ -63,7 +62,7 @@ def panel_columns(pictures: Pictures, width: int, height: int) -> int:
 
 
 def _captions(pictures: Pictures, shot: Film, device: int, k: int, columns: int) -> Text:
-    """What came of late, a character per picture; its age and the SNR; how wrong the belief is."""
+    """Say what came of late, a character per picture, its age and SNR, and the belief's error."""
     text, delivered = Text(), pictures.link.delivered[:, device]
     for back in range(columns - 1, -1, -1):
         end = k + 1 - back * pictures.every
@@ -80,7 +79,7 @@ def _captions(pictures: Pictures, shot: Film, device: int, k: int, columns: int)
 
 
 def _scene(pictures: Pictures, shot: Film, device: int, k: int, columns: int) -> Text:
-    """A frame and the belief over it as text: a character shows two pixels, one over the other."""
+    """Return a frame and the belief over it: a character shows two pixels, one over the other."""
     image = Image.fromarray(pictures.frame(shot, device, k)).crop((0, SKY_PX, WIDTH_PX, HEIGHT_PX))
     rows = columns * (HEIGHT_PX - SKY_PX) // (2 * WIDTH_PX)
     image = image.resize((columns, 2 * rows), Image.Resampling.BOX)
@@ -89,13 +88,10 @@ def _scene(pictures: Pictures, shot: Film, device: int, k: int, columns: int) ->
     ImageDraw.Draw(image).line(line, fill=(0, 0, 0))
     text = Text()
     pixels = np.asarray(image)
-    for upper, lower in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True):
-        for above, below in zip(upper, lower, strict=True):
-            text.append("▀", style=f"{_rgb(above)} on {_rgb(below)}")
+    for row, next_row in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True):
+        for above, below in zip(row, next_row, strict=True):
+            upper, lower = ("#{:02x}{:02x}{:02x}".format(*colour) for colour in (above, below))
+            text.append("▀", style=f"{upper} on {lower}")
         text.append("\n")
     text.rstrip()
     return text
-
-
-def _rgb(colour: Sequence[int]) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)

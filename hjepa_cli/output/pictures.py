@@ -4,13 +4,10 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from hjepa_cli.core.arrays import Pixels
 from hjepa_cli.storage.files import write_bytes
-
-Pixels = NDArray[np.uint8]
 
 LABEL_PX = 14  # height of the line of text above a frame
 MARGIN_PX = 4
@@ -18,17 +15,12 @@ INK, FAINT, PAPER = (20, 20, 20), (110, 110, 110), (245, 245, 245)
 
 
 def font(size_px: int = 10) -> "ImageFont.FreeTypeFont | ImageFont.ImageFont":
-    """Pillow's own font, so that every machine draws the same letters."""
+    """Return Pillow's own font, so that every machine draws the same letters."""
     return ImageFont.load_default(size_px)
 
 
 def contact_sheet(frames: Pixels, labels: Sequence[Sequence[str]]) -> Image.Image:
-    """Lay frames out in a grid with a line of text above each.
-
-    Args:
-        frames: uint8 [rows, columns, H, W, 3].
-        labels: texts [rows][columns].
-    """
+    """Lay frames uint8 [rows, columns, H, W, 3] out in a grid, labels [rows][columns] above."""
     rows, columns, height, width, _ = frames.shape
     step = (width + MARGIN_PX, height + LABEL_PX + MARGIN_PX)
     size = (columns * step[0] + MARGIN_PX, rows * step[1] + MARGIN_PX)

@@ -14,8 +14,9 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
+
+from hjepa_cli.storage.files import jsonable
 
 if TYPE_CHECKING:  # rich costs 80 ms; it is imported when something is drawn
     from rich.console import Console
@@ -27,8 +28,8 @@ FOLD_AT = 24  # a text column may be squeezed to this many characters
 GAP = 2  # blanks between columns
 
 
-class Advance(Protocol):
-    """What :meth:`Screen.progress` hands to its ``with`` block."""
+class Advance:
+    """Progress that nobody sees; :meth:`Screen.progress` shows a bar or lines."""
 
     def advance(self, count: int = 1, **fields: float) -> None:
         """Count ``count`` more units; ``fields`` (``loss=0.1``) are shown beside them."""
@@ -40,42 +41,30 @@ class Screen:
     Args:
         quiet: show results and errors only.
         json: everything except :meth:`emit` goes to stderr.
-        stdout, stderr: streams, for tests; by default the process's own.
+        stdout, stderr: streams; by default the process's own.
     """
 
     def __init__(
-        self,
-        quiet: bool = False,
-        json: bool = False,
-        *,
-        stdout: TextIO | None = None,
-        stderr: TextIO | None = None,
-    ) -> None:
-        self.quiet = quiet
-        self.json = json
-        self._stdout = stdout or sys.stdout
-        self._stderr = stderr or sys.stderr
+        self, quiet: bool = False, json: bool = False, *,
+        stdout: TextIO | None = None, stderr: TextIO | None = None,
+    ) -> None:  # fmt: skip
+        self.quiet, self.json = quiet, json
+        self._stdout, self._stderr = stdout or sys.stdout, stderr or sys.stderr
         self._bars: RichProgress | None = None
 
     @property
     def is_terminal(self) -> bool:
-        """Somebody watches, in a window where pictures can be redrawn."""
+        """Return whether somebody watches, in a window where pictures can be redrawn."""
         return _is_terminal(self._results)
 
     def say(self, text: str) -> None:
         """Print one line about the work; silent when quiet."""
-        if self.quiet:
-            return
-        if self._bars is not None:
-            self._bars.console.print(
-                one_line(text), markup=False, highlight=False, emoji=False, soft_wrap=True
-            )
-        else:
-            print(one_line(text), file=self._stderr, flush=True)
+        if not self.quiet:
+            self._print(one_line(text), self._stderr)
 
     def result(self, text: str) -> None:
         """Print one line of the outcome, also when quiet."""
-        self._print_result(one_line(text))
+        self._print(one_line(text), self._results)
 
     def error(self, message: str, hint: str | None = None) -> None:
         """Print what was wrong and, on a second line, what to do next."""
@@ -86,22 +75,14 @@ class Screen:
 
     def emit(self, document: Mapping[str, Any]) -> None:
         """Print the JSON document of ``--json``: one line, no NaN, undefined values are null."""
-        print(json.dumps(plain(document), allow_nan=False), file=self._stdout, flush=True)
+        print(json.dumps(jsonable(document), allow_nan=False), file=self._stdout, flush=True)
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """Print a table, also when quiet.
-
-        Args:
-            title: one line above it.
-            columns: headings; they may wrap at spaces.
-            rows: cells; numbers are set right-aligned, ``None`` and NaN as ``-``. Where numbers do
-                not fit the width of the terminal, the table continues in a second block that
-                repeats the first column.
-        """
+        """Print a table as :func:`layout` sets it, also when quiet; ``None`` and NaN are ``-``."""
         cells = [[_cell(value) for value in row] for row in rows]
         width = shutil.get_terminal_size((80, 24)).columns
         lines = textwrap.wrap(one_line(title), width) + layout(columns, cells, width)
-        self._print_result("\n".join(lines))
+        self._print("\n".join(lines), self._results)
 
     @contextmanager
     def progress(
@@ -113,50 +94,39 @@ class Screen:
 
         Args:
             label: what is being done, one word or two.
-            total: units of work.
+            total, done: units of work, and those that a continued run has done before.
             unit: their name, for the rate ("traj" → "310 traj/s"); without one, units are nothing
                 that people count, and only the share of them is shown.
-            done: units done before, by a run that is continued.
         """
         if self.quiet:
-            yield _Silent()
+            yield Advance()
         elif not _is_terminal(self._stderr):
             heartbeat = _Heartbeat(self._stderr, label, total, unit, done)
             yield heartbeat
-            heartbeat.finish()
+            heartbeat.print_line(f"in {heartbeat.elapsed}")
         else:
             is_inner = self._bars is not None
             with self._open_bars() as bars:
-                task = bars.add_task(
-                    label, total=total, completed=done, count="", rate="", fields=""
-                )
-                bar = _Bar(bars, task, total, unit, done)
-                bar.advance(0)
+                bar = _Bar(bars, label, total, unit, done)
                 yield bar
                 bars.refresh()
                 if is_inner:
-                    bars.remove_task(task)
+                    bars.remove_task(bar.task)
                     self.say(f"{label} {bar}")
 
     @contextmanager
     def _open_bars(self) -> Iterator["RichProgress"]:
-        """The live display; an inner ``progress`` adds a line to the outer one's."""
+        """Open the live display; an inner ``progress`` adds a line to the outer one's."""
         if self._bars is not None:
             yield self._bars
             return
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+        fields = ("count", "rate", "fields")
         with Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=20),
-            TextColumn("{task.fields[count]}", markup=False),
-            TextColumn("{task.fields[rate]}", markup=False),
-            TextColumn("{task.fields[fields]}", markup=False),
+            *(TextColumn(f"{{task.fields[{name}]}}", markup=False) for name in fields),
             TimeRemainingColumn(elapsed_when_finished=True),
             console=_console(self._stderr),
         ) as bars:
@@ -166,14 +136,12 @@ class Screen:
             finally:
                 self._bars = None
 
-    def _print_result(self, text: str) -> None:
-        """To stdout; above the bars, where they are in the same terminal."""
-        if self._bars is not None and self._results.isatty():
-            self._bars.console.print(
-                text, markup=False, highlight=False, emoji=False, soft_wrap=True
-            )
+    def _print(self, text: str, stream: TextIO) -> None:
+        """Print a text; above the bars, where they are in the same terminal."""
+        if self._bars is not None and stream.isatty():
+            self._bars.console.print(text, soft_wrap=True)  # as plain as _console says
         else:
-            print(text, file=self._results, flush=True)
+            print(text, file=stream, flush=True)
 
     @property
     def _results(self) -> TextIO:
@@ -182,7 +150,7 @@ class Screen:
 
 @contextmanager
 def ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar over device-steps whose number is a guess: it ends full, never overfull."""
+    """Show progress over device-steps whose number is a guess: it ends full, never overfull."""
     left = total
     with screen.progress(label, total, "device-steps") as bar:
 
@@ -195,73 +163,83 @@ def ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int], 
         tick(total)
 
 
-class _Silent:
-    def advance(self, count: int = 1, **fields: float) -> None:
-        pass
+class _Count(Advance):
+    """How many units are done, at which rate since this process began."""
 
-
-class _Bar:
-    """One line of the live display."""
-
-    def __init__(self, bars: "RichProgress", task: Any, total: int, unit: str, done: int) -> None:
-        self._bars, self._task, self._total, self._unit = bars, task, total, unit
+    def __init__(self, total: int, unit: str, done: int) -> None:
+        self._total, self._unit = total, unit
         self._done = self._before = done
         self._fields = ""
         self._started_s = time.monotonic()
 
+    def count(self, units: int, fields: Mapping[str, float]) -> None:
+        """Count more units; fields stay as they were where there are none."""
+        self._done += units
+        if fields:
+            self._fields = " ".join(f"{name} {value:.3g}" for name, value in fields.items())
+
+    @property
+    def elapsed(self) -> str:
+        """Return the time since the start, ``0:00:15``."""
+        return _clock(time.monotonic() - self._started_s)
+
+    @property
+    def _share(self) -> str:
+        return f"{100 * self._done // max(self._total, 1)} %"
+
+    @property
+    def _per_s(self) -> float:
+        """Return units per second, of this process alone."""
+        return (self._done - self._before) / max(time.monotonic() - self._started_s, 1e-9)
+
+    @property
+    def _rate(self) -> str:
+        return f"{_significant(self._per_s)} {self._unit}/s" if self._unit else ""
+
+
+class _Bar(_Count):
+    """One line of the live display."""
+
+    def __init__(self, bars: "RichProgress", label: str, total: int, unit: str, done: int) -> None:
+        super().__init__(total, unit, done)
+        self._bars = bars
+        texts = dict.fromkeys(("count", "rate", "fields"), "")
+        self.task = bars.add_task(label, total=total, completed=done, **texts)
+        self.advance(0)
+
     def __str__(self) -> str:
-        """How far it is, since when."""
-        elapsed_s = time.monotonic() - self._started_s
-        return f"{self._counted} {self._fields} in {_clock(elapsed_s)}".replace("  ", " ")
+        """Say how far it is, since when."""
+        return f"{self._counted} {self._fields} in {self.elapsed}".replace("  ", " ")
 
     @property
     def _counted(self) -> str:
-        share = _percent(self._done, self._total)
-        return f"{self._done}/{self._total}" if self._unit else share
+        return f"{self._done}/{self._total}" if self._unit else self._share
 
     def advance(self, count: int = 1, **fields: float) -> None:
-        self._done += count
-        self._fields = _fields(fields) or self._fields
-        rate = (self._done - self._before) / max(time.monotonic() - self._started_s, 1e-9)
-        self._bars.update(
-            self._task,
-            advance=count,
-            count=self._counted,
-            rate=f"{_significant(rate)} {self._unit}/s" if self._unit else "",
-            fields=self._fields,
-        )
+        self.count(count, fields)
+        texts = {"count": self._counted, "rate": self._rate, "fields": self._fields}
+        self._bars.update(self.task, advance=count, **texts)
 
 
-class _Heartbeat:
+class _Heartbeat(_Count):
     """Lines for log files: one every :data:`HEARTBEAT_S` and one at the end."""
 
     def __init__(self, stream: TextIO, label: str, total: int, unit: str, done: int) -> None:
-        self._stream, self._label, self._total, self._unit = stream, label, total, unit
-        self._done = self._before = done
-        self._fields = ""
-        self._started_s = self._printed_s = time.monotonic()
+        super().__init__(total, unit, done)
+        self._stream, self._label = stream, label
+        self._printed_s = self._started_s
 
     def advance(self, count: int = 1, **fields: float) -> None:
-        self._done += count
-        self._fields = _fields(fields) or self._fields
+        self.count(count, fields)
         if time.monotonic() - self._printed_s >= HEARTBEAT_S:
-            left_s = (self._total - self._done) / max(self._rate(), 1e-9)
-            self._print(f"eta {_clock(left_s)}")
+            left_s = (self._total - self._done) / max(self._per_s, 1e-9)
+            self.print_line(f"eta {_clock(left_s)}")
 
-    def finish(self) -> None:
-        self._print(f"in {_clock(time.monotonic() - self._started_s)}")
-
-    def _rate(self) -> float:
-        elapsed_s = time.monotonic() - self._started_s
-        return (self._done - self._before) / max(elapsed_s, 1e-9)
-
-    def _print(self, when: str) -> None:
+    def print_line(self, when: str) -> None:
+        """Print how far it is, and a remark on the time."""
         self._printed_s = time.monotonic()
-        done = _percent(self._done, self._total)
-        if self._unit:
-            rate = f"{_significant(self._rate())} {self._unit}/s"
-            done = f"{self._done}/{self._total} ({done}) {rate}"
-        line = f"{self._label} {done} {self._fields} {when}"
+        done = f"{self._done}/{self._total} ({self._share}) {self._rate}"
+        line = f"{self._label} {done if self._unit else self._share} {self._fields} {when}"
         print(" ".join(one_line(line).split()), file=self._stream, flush=True)
 
 
@@ -271,18 +249,15 @@ def one_line(text: str) -> str:
     The Unicode line separators and direction overrides count as control characters too.
     """
     return "".join(
-        character if character.isprintable() or character == "\u00a0" else _escape(character)
-        for character in text
+        one if one.isprintable() or one == "\u00a0" else one.encode("unicode_escape").decode()
+        for one in text
     )
 
 
 def span(
     value: float | None, interval: Sequence[float] | None, decimals: int, bound: str = ""
 ) -> str | None:
-    """Set a number with its interval: ``112.5 (104.1 – 118.0)``.
-
-    ``bound`` stands before a number that is only known to lie on one side: ``≥ 320.0 (…)``.
-    """
+    """Set a number with its interval, ``112.5 (104.1 – 118.0)``, or one-sided, ``≥ 320.0 (…)``."""
     if value is None:
         return None
     low, high = interval or (value, value)
@@ -293,10 +268,7 @@ def span(
 def tolerance(
     entry: Mapping[str, Any], value_key: str, key: str, decimals: int, bound: str
 ) -> str | None:
-    """Set a tolerance of ``eval --json``: ``112.5 (104.1 – 118.0)``.
-
-    ``bound`` stands before it where the measured range ended first.
-    """
+    """Set a tolerance of ``eval --json`` as :func:`span`, a bound where the range ended first."""
     censored, interval = entry[f"tolerance_{key}_censored"], entry[f"tolerance_{key}_ci95"]
     return span(entry[f"tolerance_{value_key}"], interval, decimals, bound if censored else "")
 
@@ -309,38 +281,13 @@ def described_steps(measured: Mapping[str, Any]) -> str:
 
 
 def percent(ratio: float | None) -> str:
-    """1.38 → ``+38.0 %``."""
+    """Return a ratio of 1.38 as ``+38.0 %``."""
     return "unbounded" if ratio is None else f"{100 * (ratio - 1):+.1f} %"
 
 
 def in_order(named: Mapping[str, Any], first: Sequence[str]) -> dict[str, Any]:
-    """What is named ``first`` in that order, then the rest: files keep names sorted."""
+    """Return what is named ``first`` in that order, then the rest: files keep names sorted."""
     return {name: named[name] for name in dict.fromkeys((*first, *named)) if name in named}
-
-
-def plain(value: Any) -> Any:
-    """Turn a result into JSON values: arrays to lists, paths to strings, NaN and ±inf to None.
-
-    Raises:
-        TypeError: for anything that has no JSON form.
-    """
-    if isinstance(value, Mapping):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, PurePath):
-        return str(value)
-    if hasattr(value, "tolist"):  # numpy and torch scalars and arrays
-        return plain(value.tolist())
-    raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-def _escape(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")
 
 
 def _console(stream: TextIO) -> "Console":
@@ -350,7 +297,7 @@ def _console(stream: TextIO) -> "Console":
 
 
 def _is_terminal(stream: TextIO) -> bool:
-    """Can a bar be redrawn here? FORCE_COLOR makes rich say yes for files; a file cannot."""
+    """Return whether a bar can be redrawn; FORCE_COLOR makes rich say yes for files too."""
     console = _console(stream)
     return stream.isatty() and console.is_interactive and not console.is_dumb_terminal
 
@@ -374,17 +321,11 @@ def layout(columns: Sequence[str], rows: Sequence[Sequence[str]], available: int
     for block in _blocks(widths, available):
 
         def set_row(row: Sequence[str], block: Sequence[int] = block) -> list[str]:
-            """One row as the lines its tallest cell needs."""
+            """Return one row as the lines that its tallest cell needs."""
             folded = [textwrap.wrap(row[i], widths[i]) or [""] for i in block]
-            return [
-                (" " * GAP)
-                .join(
-                    text.rjust(widths[i]) if right[i] else text.ljust(widths[i])
-                    for i, text in zip(block, parts, strict=True)
-                )
-                .rstrip()
-                for parts in itertools.zip_longest(*folded, fillvalue="")
-            ]
+            form = (" " * GAP).join(f"{{:{'>' if right[i] else '<'}{widths[i]}}}" for i in block)
+            lines = itertools.zip_longest(*folded, fillvalue="")
+            return [form.format(*parts).rstrip() for parts in lines]
 
         lines += [""] if lines else []
         lines += set_row(columns)
@@ -406,7 +347,7 @@ def _blocks(widths: Sequence[int], available: int) -> list[list[int]]:
 
 
 def _is_number(cell: str) -> bool:
-    """Set right-aligned: numbers, also bounds (>320) or with an interval after them, and blanks."""
+    """Return whether a cell is a number, perhaps a bound (>320) or with an interval, or blank."""
     first, *_ = cell.lstrip("<>≤≥~ ").split() or [MISSING]
     try:
         return first == MISSING or math.isfinite(float(first.replace(",", "")))
@@ -423,19 +364,11 @@ def _cell(value: object) -> str:
 
 
 def _significant(value: float) -> str:
-    """Three significant digits, never in exponent form: 0.0123, 1.23, 12.3, 123, 12346."""
+    """Set three significant digits, never in exponent form: 0.0123, 1.23, 12.3, 123, 12346."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     decimals = max(0, 2 - math.floor(math.log10(abs(value))))
     return f"{value:.{min(decimals, 6)}f}"
-
-
-def _fields(fields: Mapping[str, float]) -> str:
-    return " ".join(f"{name} {value:.3g}" for name, value in fields.items())
-
-
-def _percent(done: int, total: int) -> str:
-    return f"{100 * done // max(total, 1)} %"
 
 
 def _clock(seconds: float) -> str:

@@ -12,62 +12,58 @@ import torch
 from torch import nn
 
 from hjepa_cli.compute.device import autocast, resolve_device
-from hjepa_cli.config.settings import Settings
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.networks import health
-from hjepa_cli.core.networks.actor import Actor
-from hjepa_cli.core.networks.decoder import Decoder
+from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
-from hjepa_cli.core.networks.read_frames import read_frames
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
-from hjepa_cli.stages.frame_training import Training, standardisation_sample
-from hjepa_cli.stages.inputs import RenderedSplit, embed
+from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
+from hjepa_cli.stages.frame_training import fit
+from hjepa_cli.stages.inputs import embed
+from hjepa_cli.stages.training import TrainingRun
 
 LOOK_EVERY = 4  # steps between the held-out frames that watch training
 LOOK_FRAMES = 500  # of them, for the reconstruction error
 
 
 def describe_architecture(settings: Settings) -> dict[str, Any]:
-    """What :func:`~hjepa_cli.core.networks.model.build_modules` needs, as it goes into the checkpoint."""
+    """Return the architecture of a baseline, as it goes into the checkpoint."""
     encoder, actor = settings.encoder, settings.actor
+    recorded = ("frames", "embedding", "frame_input", "centre", "mirror")
     return {
         "kind": encoder.method,
-        "frames": encoder.frames,
-        "embedding": encoder.embedding,
-        "frame_input": encoder.frame_input,
-        "centre": encoder.centre,
-        "mirror": encoder.mirror,
+        **{name: getattr(encoder, name) for name in recorded},
         "actor_hidden": actor.hidden,
         "actor_dropout": actor.dropout,
     }
 
 
-def train(networks: nn.ModuleDict, training: Training) -> dict[str, Any]:
-    """Train a baseline in place; returns its held-out health."""
-    device = resolve_device(training.settings.device)
-    frames = training.settings.encoder.frames
-    _standardise(networks, standardisation_sample(training.train.frames, frames_each=frames))
+def train(
+    networks: nn.ModuleDict, run: TrainingRun, train: RenderedSplit, test: RenderedSplit
+) -> dict[str, Any]:
+    """Train a baseline in place; return its held-out health."""
+    device, frames = resolve_device(run.settings.device), run.settings.encoder.frames
+    _standardise(networks, standardisation_sample(train.frames, frames_each=frames))
+    look = functools.partial(_look, networks, test, run.settings)
     trained: tuple[str, ...] = ("encoder", "actor")
     if "decoder" in networks:
-        reconstruction = Reconstruction(networks, device)
-        training.fit("autoencoder", reconstruction, functools.partial(_look, networks, training))
+        fit(run, train, "autoencoder", Reconstruction(networks, device), look)
         trained = ("reader", "actor")
-    imitation = Imitation(networks, trained, device)
-    training.fit("actor", imitation, functools.partial(_look, networks, training))
+    fit(run, train, "actor", Imitation(networks, trained, device), look)
     networks.eval()
-    training.screen.say("measuring health on all frames")
-    return examine(networks, training.train, training.test, training.settings)
+    run.screen.say("measuring health on all frames")
+    return examine(networks, train, test, run.settings)
 
 
 def examine(
     networks: nn.ModuleDict, train: RenderedSplit, test: RenderedSplit, settings: Settings
 ) -> dict[str, Any]:
-    """Health of what the actor listens to, and of the actor; there is no predictor to examine."""
+    """Return the health of what the actor listens to, and of the actor; there is no predictor."""
     train_z, test_z = (_read(networks, split, settings, every=1) for split in (train, test))
-    names = plant(settings.plant).state_names
-    probe = (train_z, train.states_at(1), test_z, test.states_at(1), names)
+    names, states = plant(settings.plant).state_names, (train.states_at(1), test.states_at(1))
     report = {
-        "probe_r2": health.probe_r2(*probe),
+        "probe_r2": health.probe_r2(train_z, states[0], test_z, states[1], names),
         "effective_rank": health.effective_rank(test_z),
         "std": float(test_z.std(0).mean()),
         "action_sensitivity": None,
@@ -78,25 +74,24 @@ def examine(
     return report
 
 
-def _look(networks: nn.ModuleDict, training: Training, terms: dict[str, float]) -> dict[str, Any]:
-    """A row of ``metrics.csv``: the loss, and the held-out error of what the phase trains."""
+def _look(
+    networks: nn.ModuleDict, test: RenderedSplit, settings: Settings, terms: dict[str, float]
+) -> dict[str, Any]:
+    """Return a row of ``metrics.csv``: the loss, and the held-out error of what is trained."""
     networks.eval()
-    test, settings = training.test, training.settings
     [(phase, loss)] = terms.items()
-    error = nrmse = None
+    row: dict[str, Any] = {"term": phase, "loss": loss, "reconstruction_mse": None}
     if phase == "reconstruction":
-        error = _reconstruction_error(networks, test, settings)
-    else:
-        z = _read(networks, test, settings, every=LOOK_EVERY)
-        nrmse = _actor_error(networks, z, test, every=LOOK_EVERY)
-    return {"term": phase, "loss": loss, "reconstruction_mse": error, "actor_nrmse": nrmse}
+        row["reconstruction_mse"] = _reconstruction_error(networks, test, settings)
+        return row | {"actor_nrmse": None}
+    z = _read(networks, test, settings, every=LOOK_EVERY)
+    return row | {"actor_nrmse": _actor_error(networks, z, test, every=LOOK_EVERY)}
 
 
 def _standardise(networks: nn.ModuleDict, sample: torch.Tensor) -> None:
     """Measure what all networks take for mean and scale of a picture."""
     encoder = networks["encoder"]
-    assert isinstance(encoder, Encoder)
-    encoder.fit_standardisation(sample)
+    encoder.fit_standardisation(sample)  # type: ignore[operator]
     for network in networks.values():
         if isinstance(network, Encoder | Decoder):
             network.input_mean.copy_(encoder.input_mean)
@@ -106,7 +101,7 @@ def _standardise(networks: nn.ModuleDict, sample: torch.Tensor) -> None:
 def _read(
     networks: nn.ModuleDict, split: RenderedSplit, settings: Settings, *, every: int
 ) -> torch.Tensor:
-    """What the actor listens to in every ``every``-th step: embeddings [N · K, D]."""
+    """Return what the actor listens to in every ``every``-th step: embeddings [N · K, D]."""
     read, frames = functools.partial(read_frames, networks), settings.encoder.frames
     return embed(read, split, settings, every=every, frames=frames).flatten(0, 1)
 
@@ -115,10 +110,9 @@ def _read(
 def _actor_error(
     networks: nn.ModuleDict, z: torch.Tensor, split: RenderedSplit, *, every: int
 ) -> float:
-    """NRMSE of the actor on embeddings [N · K, D]."""
+    """Return the NRMSE of the actor on embeddings [N · K, D]."""
     actor = networks["actor"]
-    assert isinstance(actor, Actor)
-    forces = actor.act(z.to(next(actor.parameters()).device)).cpu()
+    forces = actor.act(z.to(next(actor.parameters()).device)).cpu()  # type: ignore[operator]
     return health.nrmse(forces, split.labels_at(every))
 
 
@@ -126,7 +120,7 @@ def _actor_error(
 def _reconstruction_error(
     networks: nn.ModuleDict, split: RenderedSplit, settings: Settings
 ) -> float:
-    """Of evenly spaced frames: mean squared error ÷ variance of a channel."""
+    """Return mean squared error ÷ variance of a channel, of evenly spaced frames."""
     seen = split.seen(LOOK_EVERY, frames=settings.encoder.frames)
     device = resolve_device(settings.device)
     objective = Reconstruction(networks, device)

@@ -9,23 +9,19 @@ import contextlib
 import dataclasses
 import functools
 import math
-import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hjepa_cli.compute.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.config.checks import check_settings
-from hjepa_cli.config.settings import Settings, dotted, load_settings
-from hjepa_cli.core.control.payload import raw_frame_bits
+from hjepa_cli.config.schema import Settings, dotted
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import (
     MANIFEST,
     Dataset,
-    Trajectories,
     load_dataset,
     open_directory,
     per_shard,
@@ -34,12 +30,13 @@ from hjepa_cli.core.datasets.dataset import (
 )
 from hjepa_cli.core.datasets.trajectories import generate, split_sizes
 from hjepa_cli.core.plants.conditions import altered
-from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.frames import FRAME_BITS, HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.named import plant, plant_of
-from hjepa_cli.core.plants.system import Camera
 from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.plan import Plan, seconds_of
 from hjepa_cli.storage.files import check_free_space, point_to
+from hjepa_cli.storage.runs import continue_command, differences
 from hjepa_cli.storage.shards import (
     LOG,
     NAME,
@@ -58,16 +55,10 @@ MAX_SHARDS = 50_000  # which make a dataset.json of 10 MB; readers take 16
 
 
 def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[str, Any]:
-    """Collect a dataset.
+    """Collect a dataset; return the document of ``--json``, see :func:`describe`.
 
-    Args:
-        settings: ``settings.collect`` of ``settings.plant``, drawn from ``settings.seed``.
-        screen: where progress goes.
-        out: the dataset's directory; ``None`` is the next free ``data/<plant>-<nnnn>``. One that
-            holds a finished dataset is left as it is and described again.
-
-    Returns:
-        The document of ``--json``; ``frames_per_s`` is null if nothing was rendered.
+    ``out`` is its directory, ``None`` the next free ``data/<plant>-<nnnn>``. One that holds a
+    finished dataset is left as it is and described again.
 
     Raises:
         UsageError: a count that is too small, or ``out`` holds something else.
@@ -85,19 +76,19 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
         definition["conditions"] = conditions
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
-            remove_log(directory)  # a kill between the two has left it behind
-            data = load_dataset(directory, settings.plant)
-            changed = "" if data.settings == definition else ", made with other settings"
-            screen.say(f"{directory} holds a finished dataset{changed}; it is left as it is")
-            return describe(data, time.perf_counter() - started, frames_per_s=None)
-
+            return describe_finished(directory, screen, settings.plant, definition)
         check_same(directory, settings)
-        shards_there = (path for path in directory.iterdir() if NAME.fullmatch(path.name))
-        there_bytes = sum(path.stat().st_size for path in shards_there)
+        there = (path for path in directory.iterdir() if NAME.fullmatch(path.name))
+        there_bytes = sum(path.stat().st_size for path in there)
         check_free_space(directory, size_bytes(settings) - there_bytes)
         with telling_how_to_go_on(directory):
             log = ShardLog(directory, settings.as_dict())
-            frames_per_s = rate(camera, settings)
+            sample = generate(
+                settings, "train", range(min(TOGETHER, settings.collect.trajectories))
+            )
+            began = time.perf_counter()
+            frames_of(camera, sample.states)  # rendered and dropped
+            frames_per_s = sample.states[..., 0].size / (time.perf_counter() - began)
             data = write_manifest(
                 directory,
                 settings=definition,
@@ -107,7 +98,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             )
             remove_log(directory)
     result = describe(data, time.perf_counter() - started, frames_per_s)
-    bits = raw_frame_bits(FRAMES_PER_SAMPLE, HEIGHT_PX, WIDTH_PX)
+    bits = FRAMES_PER_SAMPLE * FRAME_BITS
     screen.say(
         f"{result['trajectories']} training trajectories in {result['seconds']:.1f} s: "
         f"{result['dataset']}; as raw frames the training phase takes "
@@ -116,9 +107,49 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     return result
 
 
+def plan(settings: Settings, *, out: Path | None = None) -> Plan:
+    """Plan the simulation of all splits and, if frames are stored, their pictures."""
+    options, sizes = settings.collect, split_sizes(settings).values()
+    steps = sum(count * steps for count, steps in sizes)
+    frames = steps + sum(count for count, _ in sizes) if options.frames == "stored" else 0
+    work = [
+        f"simulate {options.trajectories} training, {options.test_trajectories} held-out and "
+        f"{options.clean_trajectories} clean trajectories of plant {settings.plant} ({steps} steps)"
+    ]
+    if frames:
+        work.append(f"render {frames} frames of {HEIGHT_PX} x {WIDTH_PX} RGB")
+    directory = out or f"data/{settings.plant}-<next number>"
+    return Plan(
+        command="collect",
+        reads=[],
+        work=work,
+        writes=[f"dataset {directory} in {len(shards_of(settings))} shards"],
+        writes_bytes=size_bytes(settings),
+        seconds=2 + seconds_of({"simulated steps": steps, "rendered frames": frames}),
+    )
+
+
+def describe_finished(
+    directory: Path,
+    screen: Screen,
+    plant_name: str | None = None,
+    definition: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the document of a complete dataset, and say if other settings than these made it.
+
+    Raises DataError if it is damaged, or of another plant.
+    """
+    remove_log(directory)  # a kill between the two has left it behind
+    data = load_dataset(directory, plant_name)
+    changed = definition is not None and data.settings != definition
+    made = ", made with other settings" * changed
+    screen.say(f"{directory} holds a finished dataset{made}; it is left as it is")
+    return describe(data, 0.0, frames_per_s=None)
+
+
 @contextlib.contextmanager
 def telling_how_to_go_on(directory: Path) -> Iterator[None]:
-    """From the first byte to the last: nothing finished is lost, and the message says so."""
+    """Turn what stops a collection into a message that nothing finished is lost."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -133,23 +164,9 @@ def telling_how_to_go_on(directory: Path) -> Iterator[None]:
 
 
 def check_same(directory: Path, settings: Settings) -> None:
-    """Refuse to go on with other settings than those that a collection was begun with.
-
-    Raises:
-        UsageError: naming them.
-    """
-    if not (directory / LOG).exists():
-        return
-    before, now = (
-        dotted(given.as_dict() | {"preset": None})
-        for given in (recorded_settings(directory), settings)
-    )
-    changed = [
-        f"{key} = {before.get(key)!r}, not {now.get(key)!r}"
-        for key in sorted(before.keys() | now.keys())
-        if before.get(key) != now.get(key)
-    ]
-    if changed:
+    """Raise UsageError where a collection was begun with other settings."""
+    begun = recorded_settings(directory) if (directory / LOG).exists() else settings
+    if changed := differences(begun.as_dict(), settings.as_dict()):
         raise UsageError(
             f"{directory} holds an unfinished dataset with other settings: {'; '.join(changed)}",
             hint=f"{continue_command(directory)} continues it; or choose another --out DIR",
@@ -157,10 +174,9 @@ def check_same(directory: Path, settings: Settings) -> None:
 
 
 def recorded_settings(directory: Path) -> Settings:
-    """What is being collected in ``directory``; settings that its version had not, by its preset.
+    """Return what is being collected; settings that its version had not are its preset's.
 
-    Raises:
-        DataError: the log is damaged, or of a version with other settings.
+    Raises DataError if the log is damaged, or of a version with other settings.
     """
     task = read_task(directory)
     preset = task.pop("preset", None)
@@ -178,29 +194,10 @@ def recorded_settings(directory: Path) -> Settings:
 
 
 def check(settings: Settings) -> None:
-    """Refuse sizes that make no dataset.
-
-    Raises:
-        UsageError: naming the flag or setting.
-    """
-    options = settings.collect
-    for name, value, least in (
-        ("--trajectories", options.trajectories, 1),
-        ("--test-trajectories", options.test_trajectories, 1),
-        ("collect.clean_trajectories", options.clean_trajectories, 1),
-        ("--steps", options.steps, 1),
-        ("collect.clean_steps", options.clean_steps, 1),
-        ("collect.exploration_hold_steps", options.exploration_hold_steps, 1),
-        ("collect.exploration_n", options.exploration_n, 0),
-        ("collect.x_m", options.x_m, 0),
-        ("collect.x_dot_m_s", options.x_dot_m_s, 0),
-        ("collect.theta_rad", options.theta_rad, 0),
-        ("collect.theta_dot_rad_s", options.theta_dot_rad_s, 0),
-    ):
-        if value < least:
-            raise UsageError(f"{name} = {value}; expected at least {least}")
+    """Raise UsageError where sizes make no dataset, naming the setting."""
+    check_settings(settings)
     total = sum(count for count, _ in split_sizes(settings).values())
-    most = MAX_SHARDS * per_shard(options.frames == "stored")
+    most = MAX_SHARDS * per_shard(settings.collect.frames == "stored")
     if total > most:
         raise UsageError(
             f"{total} trajectories; one dataset holds at most {most}",
@@ -208,22 +205,32 @@ def check(settings: Settings) -> None:
         )
 
 
+def shards_of(settings: Settings) -> list[Shard]:
+    """Return the shards that the settings make."""
+    sizes = {name: count for name, (count, _) in split_sizes(settings).items()}
+    return cut(sizes, per_shard(settings.collect.frames == "stored"))
+
+
 def make_shards(
     settings: Settings, directory: Path, log: ShardLog, screen: Screen
 ) -> list[Described]:
     """Simulate, and render if frames are stored, every shard that is not there yet."""
-    stored = settings.collect.frames == "stored"
-    sizes = {name: count for name, (count, _) in split_sizes(settings).items()}
-    shards = cut(sizes, per_shard(stored))
-    left = [shard for shard in shards if not is_done(shard, settings, log)]
-    done = sum(sizes.values()) - sum(shard.stop - shard.start for shard in left)
+    shards, stored = shards_of(settings), settings.collect.frames == "stored"
+
+    def is_done(shard: Shard) -> bool:
+        count, (_, steps) = shard.stop - shard.start, split_sizes(settings)[shard.split]
+        ours = {"split": shard.split, "trajectories": count, "steps": steps, "stored": stored}
+        return ours.items() <= log.done.get(shard.name, {}).items()
+
+    left = [shard for shard in shards if not is_done(shard)]
+    total, to_do = (sum(shard.stop - shard.start for shard in some) for some in (shards, left))
     screen.say(
         f"collecting trajectories of plant {settings.plant}: {len(left)} of {len(shards)} shards"
     )
     make = functools.partial(make_shard, settings, directory)
     enough = sum(count * steps for count, steps in split_sizes(settings).values()) >= WORTH_WORKERS
     with (
-        screen.progress("collect", sum(sizes.values()), "trajectories", done=done) as bar,
+        screen.progress("collect", total, "trajectories", done=total - to_do) as bar,
         open_executor(min(cores(), MAX_WORKERS, len(left)) if enough else 0) as (executor, workers),
     ):
         for described in finished(executor, workers, make, left):
@@ -232,74 +239,41 @@ def make_shards(
     return [log.done[shard.name] for shard in shards]
 
 
-def is_done(shard: Shard, settings: Settings, log: ShardLog) -> bool:
-    """Its file is intact, and described as ours would be."""
-    expected = {
-        "split": shard.split,
-        "trajectories": shard.stop - shard.start,
-        "steps": split_sizes(settings)[shard.split][1],
-        "stored": settings.collect.frames == "stored",
-    }
-    described = log.done.get(shard.name, {})
-    return all(described.get(key) == value for key, value in expected.items())
-
-
 def make_shard(settings: Settings, directory: Path, shard: Shard) -> Described:
-    """One unit of parallel work: decided by its arguments, written atomically, so repeatable."""
+    """Do a unit of parallel work: decided by its arguments, written atomically, so repeatable."""
     made = generate(settings, shard.split, range(shard.start, shard.stop))
     if settings.collect.frames == "stored":
-        made = dataclasses.replace(made, frames=film(plant(settings.plant).camera(), made))
+        made = dataclasses.replace(
+            made, frames=frames_of(plant(settings.plant).camera(), made.states, TOGETHER)
+        )
     return write_shard(directory, shard, made, settings.plant)
 
 
-def film(camera: Camera, made: Trajectories) -> np.ndarray:
-    """Frames [N, T + 1, H, W, 3] of some trajectories."""
-    frames = np.empty((*made.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3), np.uint8)
-    for start in range(0, len(made), TOGETHER):
-        states = made.states[start : start + TOGETHER]
-        images = camera.render(states.reshape(-1, states.shape[-1]))
-        frames[start : start + TOGETHER] = images.reshape(-1, *frames.shape[1:])
-    return frames
-
-
-def rate(camera: Camera, settings: Settings) -> float:
-    """Frames per second of a sample that is rendered and dropped."""
-    count = min(TOGETHER, settings.collect.trajectories)
-    sample = generate(settings, "train", range(count))
-    started = time.perf_counter()
-    film(camera, sample)
-    return sample.states[..., 0].size / (time.perf_counter() - started)
-
-
 def size_bytes(settings: Settings) -> int:
-    """What the dataset takes on disk, without headers."""
-    kind, frame_bytes = plant(settings.plant), 0
+    """Return what the dataset takes on disk, without headers."""
+    kind = plant(settings.plant)
     state_bytes, force_bytes = 4 * len(kind.state_names), 8 * math.prod(kind.action_shape)
-    if settings.collect.frames == "stored":
-        frame_bytes = HEIGHT_PX * WIDTH_PX * 3
+    frame_bytes = HEIGHT_PX * WIDTH_PX * 3 * (settings.collect.frames == "stored")
     return sum(
         count * ((steps + 1) * (state_bytes + frame_bytes) + force_bytes * steps)
         for count, steps in split_sizes(settings).values()
     )
 
 
-def continue_command(directory: Path) -> str:
-    """What takes an interrupted collection up again."""
-    return f"hjepa resume {shlex.quote(str(directory))}"
-
-
 def describe(data: Dataset, seconds: float, frames_per_s: float | None) -> dict[str, Any]:
-    """The document of ``--json``; ``training_uplink_bits``: what sending its frames would take."""
-    count, steps = (data.splits["train"][key] for key in ("trajectories", "steps"))
+    """Return the document of ``--json``; ``frames_per_s`` is ``None`` if nothing was rendered.
+
+    Its uplink is what sending the frames would take.
+    """
+    counts = {name: split["trajectories"] for name, split in data.splits.items()}
+    count, steps = counts["train"], data.splits["train"]["steps"]
     return {
         "dataset": str(data.path),
         "trajectories": count,
-        "test_trajectories": data.splits["test"]["trajectories"],
-        "clean_trajectories": data.splits["clean"]["trajectories"],
+        "test_trajectories": counts["test"],
+        "clean_trajectories": counts["clean"],
         "steps": steps,
         "seconds": round(seconds, 3),
         "frames_per_s": None if frames_per_s is None else round(frames_per_s, 1),
-        "training_uplink_bits": count
-        * steps
-        * raw_frame_bits(FRAMES_PER_SAMPLE, HEIGHT_PX, WIDTH_PX),
+        "training_uplink_bits": count * steps * FRAMES_PER_SAMPLE * FRAME_BITS,
     }

@@ -9,36 +9,32 @@ import dataclasses
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from hjepa_cli.config.checks import METHODS, TRUE_STATE, check_methods
+from hjepa_cli.config.checks import check_methods, needs_model, without_model
+from hjepa_cli.config.schema import dotted
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.statistics import student_interval
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, require
 from hjepa_cli.output.screen import Screen, span, tolerance
-from hjepa_cli.stages.report import (
-    FIGURE_FORMATS,
-    NO_RESULT,
-    SMOKE,
-    found_runs,
-    inputs_of,
-    stage_of,
-)
+from hjepa_cli.plugins import METHODS
+from hjepa_cli.stages.report import NO_RESULT, SMOKE, found_runs, inputs_of, stage_of
 from hjepa_cli.storage import runs
 
-AVERAGED = {  # of an entry of ``eval --json``, where the interval of it goes, and its range
-    "nmae": ("nmae_ci95", (0.0, None)),
-    "nmae_every_step": ("nmae_every_step_ci95", (0.0, None)),
-    "score": ("score_ci95", (0.0, None)),
-    "tolerance_gap_steps": ("tolerance_gap_ci95", (0.0, None)),
-    "tolerance_p": ("tolerance_p_ci95", (0.0, 1.0)),
+AVERAGED = {  # of an entry of ``eval --json``, and where its interval goes
+    "nmae": "nmae_ci95",
+    "nmae_every_step": "nmae_every_step_ci95",
+    "score": "score_ci95",
+    "tolerance_gap_steps": "tolerance_gap_ci95",
+    "tolerance_p": "tolerance_p_ci95",
 }
+LARGEST = ("bits_per_transmission", "tolerance_gap_censored", "tolerance_p_censored")
 ALIKE = ("plant", "loop_version", "horizon", "acceptable_score", "acceptable_lq_ratio")
 
 ByMethod = dict[str, dict[int, Entry]]
@@ -56,10 +52,40 @@ class Evaluation:
     training_seed: int | None
 
     def seed_of(self, method: str) -> int:
-        """The training's, or of a method without a model the evaluation's."""
-        if method in TRUE_STATE or self.training_seed is None:
+        """Return the training's seed, or of a method without a model the evaluation's."""
+        if not needs_model(method) or self.training_seed is None:
             return int(self.result["seed"])
         return self.training_seed
+
+    def alike(self) -> dict[str, Any]:
+        """Return what must agree in all runs that are compared."""
+        sections = {name: self.config[name] for name in ("protocol", "conditions", "collect")}
+        clean = (*curves.CLEAN, "start")
+        sections["collect"] = {k: v for k, v in sections["collect"].items() if k in clean}
+        return {key: self.result[key] for key in ALIKE} | dotted(sections)
+
+    def draws(self) -> dict[str, Any]:
+        """Return what must agree within a training besides: methods share their draws there."""
+        return {"seed": self.result["seed"], "dataset": self.dataset}
+
+
+class _Result(msgspec.Struct):
+    """All of a result of ``eval`` that a comparison relies on."""
+
+    plant: str
+    loop_version: int
+    horizon: list[int]
+    acceptable_score: float
+    acceptable_lq_ratio: float
+    seed: int
+    training_seeds: dict[str, Any]
+    methods: dict[str, Any]
+
+
+class _Config(msgspec.Struct):
+    protocol: dict[str, Any]
+    conditions: dict[str, Any]
+    collect: dict[str, Any]
 
 
 def run(
@@ -68,16 +94,15 @@ def run(
     *,
     methods: Sequence[str] | None = None,
     figures: Path | None = None,
-    formats: Sequence[str] = FIGURE_FORMATS,
+    formats: Sequence[str] = ("pdf",),
 ) -> dict[str, Any]:
-    """Compare evaluations; returns the document of ``--json``.
+    """Compare evaluations; return the document of ``--json``.
 
     Args:
-        screen: where to say so.
+        screen: shows the tables.
         paths: runs of ``eval``, or directories that hold some; none: ``runs/eval``.
         methods: these, in this order, the first against the others; default: all that were found.
-        figures: also draw the paper's Fig. 3 with bands over trainings into this directory.
-        formats: of this figure.
+        figures, formats: a directory for the paper's Fig. 3, with bands over trainings, and how.
 
     Raises:
         UsageError: no such method.
@@ -87,11 +112,9 @@ def run(
     """
     if methods is not None:
         check_methods(tuple(methods))
-    if figures is not None and find_spec("matplotlib") is None:
-        raise MissingInputError(
-            "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
-        )
-    found = [opened(directory, methods) for directory in evaluations(paths)]
+    if figures is not None:
+        require("matplotlib", "a figure needs matplotlib", "plot")
+    found = [open_evaluation(directory, methods) for directory in evaluations(paths)]
     if any(one.config["preset"] == SMOKE for one in found):
         screen.say(NO_RESULT)
     check_alike(found)
@@ -103,7 +126,8 @@ def run(
         "acceptable_score": first["acceptable_score"],
         "horizon": first["horizon"],
         "methods": {
-            name: averaged(list(of.values())) | {"n_trainings": count(name, of)}
+            name: averaged(list(of.values()))
+            | {"n_trainings": 0 if not needs_model(name) else len(of)}
             for name, of in by_method.items()
         },
         "differences": differences(by_method),
@@ -115,21 +139,19 @@ def run(
 
 
 def evaluations(paths: Sequence[Path]) -> list[Path]:
-    """The finished runs of ``eval`` among and below ``paths``. Raises MissingInputError."""
+    """Return the finished runs of ``eval`` among and below ``paths``. Raises MissingInputError."""
     places = list(paths) or [runs.ROOT / "eval"]
-    made_by = "hjepa eval"
-    found = [one for one in found_runs(places, made_by) if stage_of(one) == "eval"]
+    found = [one for one in found_runs(places, "hjepa eval") if stage_of(one) == "eval"]
     if not found:
         where = ", ".join(map(str, places))
-        raise MissingInputError(f"no finished run of eval in {where}", hint=made_by)
+        raise MissingInputError(f"no finished run of eval in {where}", hint="hjepa eval")
     return found
 
 
-def opened(directory: Path, methods: Sequence[str] | None) -> Evaluation:
-    """One run, reduced to ``methods``.
+def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluation:
+    """Open one run, reduced to ``methods``.
 
-    Raises:
-        DataError: no result of ``eval``, an older one, or models of several trainings.
+    Raise DataError for no result of ``eval``, an older one, or models of several trainings.
     """
     result, config = runs.read_result(directory), runs.read_config(directory)
     environment = runs.read_environment(directory)
@@ -140,11 +162,8 @@ def opened(directory: Path, methods: Sequence[str] | None) -> Evaluation:
             f"{directory / runs.RESULT}: {reason}",
             hint=f"leave it out, or in its place: {shlex.join(again)}",
         )
-    entries = {
-        name: entry
-        for name, entry in result["methods"].items()
-        if methods is None or name in methods
-    }
+    all_of = result["methods"]
+    entries = {name: all_of[name] for name in all_of if methods is None or name in methods}
     dataset = environment["inputs"].get("dataset")
     return Evaluation(
         directory,
@@ -156,18 +175,13 @@ def opened(directory: Path, methods: Sequence[str] | None) -> Evaluation:
 
 
 def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
-    """Why a run cannot be compared with others, if anything is wrong with it."""
-    for key in (*ALIKE, "seed"):
-        if key not in result:
-            return f"'{key}' is missing"
-    for section in ("protocol", "conditions", "collect"):
-        if not isinstance(config.get(section), dict):
-            return f"its settings have no [{section}]"
-    if not isinstance(result.get("training_seeds"), dict):
-        return "it does not say with which seeds its models were trained (an older version?)"
-    if not isinstance(result.get("methods"), dict):
-        return "no methods"
-    steps = len(result["horizon"]) if isinstance(result["horizon"], list) else 0
+    """Say why a run cannot be compared with others, if anything is wrong with it."""
+    try:
+        msgspec.convert(result, _Result)
+        msgspec.convert(config, _Config)
+    except msgspec.ValidationError as error:
+        return f"{error} (an older version?)"
+    steps = len(result["horizon"])
     for name, entry in result["methods"].items():
         if reason := curves.flaw(entry):
             return f"method '{name}': {reason}"
@@ -181,12 +195,11 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
 def training_seed(
     directory: Path, seeds: Mapping[str, Any], entries: Mapping[str, Entry]
 ) -> int | None:
-    """The one seed that the models of ``entries`` were trained with; None if they need no model.
+    """Return the one seed of the models of ``entries``; None if they need no model.
 
-    Raises:
-        DataError: it is not known, or there are several.
+    Raise DataError where it is not known, or where there are several.
     """
-    of = {name: seeds.get(name) for name in entries if name not in TRUE_STATE}
+    of = {name: seeds.get(name) for name in entries if needs_model(name)}
     for name, seed in of.items():
         if type(seed) is not int:
             raise DataError(
@@ -205,42 +218,29 @@ def training_seed(
 
 def check_alike(found: Sequence[Evaluation]) -> None:
     """Refuse what is not measured alike. Raises DataError naming the difference."""
-    first, of_training = found[0], dict[int | None, Evaluation]()
+    of_training: dict[int, Evaluation] = {}
     for other in found:
-        named = [(first, key, first.result[key], other.result[key]) for key in ALIKE]
-        for section in ("protocol", "conditions"):
-            ours, theirs = first.config[section], other.config[section]
-            named += [
-                (first, f"{section}.{key}", ours.get(key), theirs.get(key))
-                for key in dict.fromkeys((*ours, *theirs))
-            ]
-        named += [
-            (first, f"collect.{key}", first.config["collect"].get(key), value)
-            for key, value in other.config["collect"].items()
-            if key in (*curves.CLEAN, "start")
-        ]
-        # Draws may differ from training to training; within one they are what methods share.
+        checks = [(found[0], found[0].alike(), other.alike())]
         if other.training_seed is not None:
             peer = of_training.setdefault(other.training_seed, other)
-            named.append((peer, "seed", peer.result["seed"], other.result["seed"]))
-            named.append((peer, "dataset", peer.dataset, other.dataset))
-        for one, key, ours, theirs in named:
-            if ours != theirs:
-                raise DataError(
-                    f"{key} is {ours!r} in {one.directory}, {theirs!r} in {other.directory}: not "
-                    "to be compared",
-                    hint="name runs that were measured alike, or measure one again",
-                )
+            checks.append((peer, peer.draws(), other.draws()))
+        for one, ours, theirs in checks:
+            for key in dict.fromkeys((*ours, *theirs)):
+                if ours.get(key) != theirs.get(key):
+                    raise DataError(
+                        f"{key} is {ours.get(key)!r} in {one.directory}, {theirs.get(key)!r} in "
+                        f"{other.directory}: not to be compared",
+                        hint="name runs that were measured alike, or measure one again",
+                    )
 
 
 def collected(
     found: Sequence[Evaluation], methods: Sequence[str] | None
 ) -> tuple[ByMethod, list[int]]:
-    """Entries by method and seed, and the training seeds, the same for all trained methods.
+    """Return entries by method and seed, and the training seeds, one set for all trained methods.
 
-    Raises:
-        MissingInputError: fewer than two trainings, or not the same ones for every method.
-        DataError: two models of one method and one seed.
+    Raise MissingInputError for fewer than two trainings, or not the same ones for every method, and
+    DataError for two models of one method and one seed.
     """
     by_method: ByMethod = {}
     sources: dict[tuple[str, int], Path] = {}
@@ -250,7 +250,7 @@ def collected(
             source = sources.setdefault((name, seed), one.directory)
             known = by_method.setdefault(name, {}).setdefault(seed, entry)
             # Measured again elsewhere, what needs no model may differ in the last digits.
-            if name not in TRUE_STATE and known != entry:
+            if needs_model(name) and known != entry:
                 raise DataError(
                     f"two measurements of {name} with training seed {seed}: {source} and "
                     f"{one.directory}",
@@ -268,9 +268,9 @@ def collected(
     for name in order:
         known_seeds = by_method.get(name, {})
         missing = [seed for seed in seeds if seed not in known_seeds]
-        if name in TRUE_STATE and not known_seeds:
+        if not needs_model(name) and not known_seeds:
             raise MissingInputError(f"{name} was not measured", hint=f"hjepa eval --methods {name}")
-        if name not in TRUE_STATE and missing:
+        if needs_model(name) and missing:
             raise MissingInputError(
                 f"{name} was not measured with training seed {', '.join(map(str, missing))}",
                 hint=f"hjepa eval --methods {name} with a model of that seed, or leave it out: "
@@ -279,65 +279,55 @@ def collected(
     return {name: dict(sorted(by_method[name].items())) for name in order}, seeds
 
 
-def count(method: str, of: Mapping[int, Entry]) -> int:
-    """How many trainings a mean is over: none for methods without a model."""
-    return 0 if method in TRUE_STATE else len(of)
-
-
 def averaged(entries: Sequence[Entry]) -> Entry:
-    """The entry of a method over its trainings: means, and Student's intervals over trainings.
+    """Return the entry of a method over its trainings: means, Student's intervals over trainings.
 
     Of a single entry (what needs no training, measured on the same draws every time) the interval
     stays its own, over devices or rollouts.
     """
-    keys = ("bits_per_transmission", "tolerance_gap_censored", "tolerance_p_censored")
+    windows = ("nmae_windows", "nmae_windows_ci95")
     if len(entries) == 1:
-        kept = [*keys, "nmae_windows", "nmae_windows_ci95", "gap_curve", "delivery_curve"]
-        kept += [*AVERAGED, *(interval for interval, _ in AVERAGED.values())]
+        kept = (*LARGEST, *windows, "gap_curve", "delivery_curve", *AVERAGED, *AVERAGED.values())
         return {key: entries[0][key] for key in kept}
-    mean: Entry = {}
-    for key in keys:
+    mean: Entry = {name: {} for name in windows}
+    for key in LARGEST:
         values = [entry[key] for entry in entries]
-        mean[key] = max(values) if all(value is not None for value in values) else None
-    for key, (interval, ends) in AVERAGED.items():
-        mean[key], mean[interval] = over_trainings([entry[key] for entry in entries], ends)
-    mean["nmae_windows"], mean["nmae_windows_ci95"] = {}, {}
+        mean[key] = None if None in values else max(values)
+    for key, interval in AVERAGED.items():
+        values, most = [entry[key] for entry in entries], 1.0 if key == "tolerance_p" else np.inf
+        mean[key], mean[interval] = over_trainings(values, 0.0, most)
     for window in entries[0]["nmae_windows"]:
         values = [entry["nmae_windows"][window] for entry in entries]
-        mean["nmae_windows"][window], mean["nmae_windows_ci95"][window] = over_trainings(
-            values, (0.0, None)
-        )
+        for name, value in zip(windows, over_trainings(values, 0.0), strict=True):
+            mean[name][window] = value
     for curve, where in (("gap_curve", "d"), ("delivery_curve", "p")):
         mean[curve] = []
         for points in zip(*(entry[curve] for entry in entries), strict=True):
-            score, ci95 = over_trainings([point["score"] for point in points], (0.0, None))
+            score, ci95 = over_trainings([point["score"] for point in points], 0.0)
             mean[curve].append({where: points[0][where], "score": score, "ci95": ci95})
     return mean
 
 
 def over_trainings(
-    values: Sequence[Any], ends: tuple[float | None, float | None] = (None, None)
+    values: Sequence[Any], least: float = -np.inf, most: float = np.inf
 ) -> tuple[Any, Any]:
-    """Mean and 95 % interval of numbers, or of equally long lists of numbers; None stays None.
+    """Return mean and 95 % interval of numbers or of equally long lists of them; None stays None.
 
-    The interval is cut where the values' range ``ends``.
+    The interval is cut to ``least`` … ``most``, the range of the values.
     """
-    if any(value is None for value in values):
+    if None in values:
         return None, None
     array = np.array(values, float)
-    low, high = (-np.inf if ends[0] is None else ends[0]), (np.inf if ends[1] is None else ends[1])
-    interval = np.clip(student_interval(array), low, high)
+    interval = np.clip(student_interval(array), least, most)
     return array.mean(axis=0).tolist(), interval.T.tolist()
 
 
 def differences(
-    by_method: Mapping[str, Mapping[int, Entry]], left_out: Sequence[str] = TRUE_STATE
+    by_method: Mapping[str, Mapping[int, Entry]], left_out: Sequence[str] | None = None
 ) -> list[dict[str, Any]]:
     """Compare the first method with each other one, paired within trainings.
 
-    Args:
-        by_method: entries by training seed.
-        left_out: methods that are not paired, since no training and no draw of theirs differs.
+    Methods without a model, or those ``left_out``, are not paired: no training of theirs differs.
 
     Returns:
         Per other method: ``nmae_windows`` and ``nmae_every_step``, first minus other;
@@ -349,22 +339,17 @@ def differences(
     first, *others = by_method
     found: list[dict[str, Any]] = []
     for other in others:
-        if other in left_out or first in left_out:
+        if {first, other} & set(without_model() if left_out is None else left_out):
             continue
         pairs = [(by_method[first][s], by_method[other][s]) for s in by_method[first]]
-        windows = {
-            window: _described(
-                [a["nmae_windows"][window] - b["nmae_windows"][window] for a, b in pairs]
-            )
-            for window in pairs[0][0]["nmae_windows"]
-        }
-        every = _described([a["nmae_every_step"] - b["nmae_every_step"] for a, b in pairs])
+        both = [(a["nmae_windows"], b["nmae_windows"]) for a, b in pairs]
+        every = [a["nmae_every_step"] - b["nmae_every_step"] for a, b in pairs]
         found.append(
             {
                 "method": first,
                 "over": other,
-                "nmae_windows": windows,
-                "nmae_every_step": every,
+                "nmae_windows": {w: _described([a[w] - b[w] for a, b in both]) for w in both[0][0]},
+                "nmae_every_step": _described(every),
                 "tolerance_gap_ratio": _ratio(pairs, "gap_steps", "gap"),
                 "tolerance_p_ratio": _ratio([(b, a) for a, b in pairs], "p", "p"),
             }
@@ -373,21 +358,17 @@ def differences(
 
 
 def _ratio(pairs: Sequence[tuple[Entry, Entry]], key: str, kind: str) -> dict[str, Any] | None:
-    """Geometric mean of the ratio of a tolerance, first ÷ second, with its interval."""
+    """Return the geometric mean of the ratio of a tolerance, first ÷ second, with its interval."""
     values = [tuple(entry[f"tolerance_{key}"] for entry in pair) for pair in pairs]
     censored = any(entry[f"tolerance_{kind}_censored"] for pair in pairs for entry in pair)
     if censored or not all(a and b for a, b in values):
         return None
-    logarithm = _described([math.log(a / b) for a, b in values])
-    return {
-        "mean": math.exp(logarithm["mean"]),
-        "ci95": [math.exp(end) for end in logarithm["ci95"]],
-    }
+    mean, ci95 = over_trainings([math.log(a / b) for a, b in values])
+    return {"mean": math.exp(mean), "ci95": [math.exp(end) for end in ci95]}
 
 
 def _described(values: Sequence[float]) -> dict[str, Any]:
-    mean, ci95 = over_trainings(values)
-    return {"mean": mean, "ci95": ci95}
+    return dict(zip(("mean", "ci95"), over_trainings(values), strict=True))
 
 
 def show(document: Mapping[str, Any], screen: Screen) -> None:
@@ -442,8 +423,7 @@ def draw(
     document: Mapping[str, Any], directory: Path, formats: Sequence[str], screen: Screen
 ) -> list[Path]:
     """Write the paper's Fig. 3, bands over trainings, as ``trainings.<format>``."""
-    from hjepa_cli.output.comparison import comparison_figure
-    from hjepa_cli.output.figures import save
+    from hjepa_cli.output.figures import comparison_figure, save
     from hjepa_cli.storage.files import make_directory
 
     drawn = comparison_figure(

@@ -15,11 +15,11 @@ from hjepa_cli.core.datasets.dataset import (
     find_newest_dataset,
     load_dataset,
 )
-from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError
+from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError, require
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.plan import RATES_PER_S, Plan, size
+from hjepa_cli.stages.plan import Plan, seconds_of, size
 from hjepa_cli.storage import files
 
 Result = dict[str, Any]
@@ -27,41 +27,33 @@ Result = dict[str, Any]
 ROOT = Path("data")
 FORMATS = {"hdf5": (".h5", ".hdf5"), "npz": (".npz",)}  # the first suffix is written by default
 COMPRESSED_FRAME_BYTES = 700
-COMPRESSED_FRAMES_PER_S = 2_000.0
 
 
 def show_info(screen: Screen, path: Path | None) -> Result:
-    """Describe a dataset from its manifest.
-
-    Raises:
-        MissingInputError: no dataset there.
-        DataError: it is damaged.
-    """
-    data = opened(path, screen)
+    """Describe a dataset from its manifest. Raise MissingInputError or DataError."""
+    data = open_dataset(path, screen)
     result = summary(data)
-    rows: list[list[object]] = [
-        ["plant", data.plant],
-        ["seed", data.settings.get("seed")],
-        ["frames", data.frames],
-        ["camera version", data.camera.get("version")],
-        ["on disk", size(result["size_bytes"])],
-        ["sha256", data.digest],
-    ]
+    rows = {
+        "plant": data.plant,
+        "seed": data.settings.get("seed"),
+        "frames": data.frames,
+        "camera version": data.camera.get("version"),
+        "on disk": size(result["size_bytes"]),
+        "sha256": data.digest,
+    }
     for name, split in result["splits"].items():
         trajectories = f"{split['trajectories']} trajectories of {split['steps']} steps"
-        rows.append([name, f"{trajectories} in {split['shards']} shards"])
+        rows[name] = f"{trajectories} in {split['shards']} shards"
     collected = data.settings.get("collect", {})
-    rows += [[f"collect.{key}", value] for key, value in collected.items() if key != "plant"]
-    screen.table(f"Dataset {data.path}", ["", "value"], rows)
+    rows |= {f"collect.{key}": value for key, value in collected.items() if key != "plant"}
+    screen.table(f"Dataset {data.path}", ["", "value"], list(rows.items()))
     return {**result, "config": data.settings, "camera": data.camera}
 
 
 def verify(screen: Screen, paths: Sequence[Path]) -> Result:
     """Read every shard and check sha256, shapes and values; all of data/ if none is named.
 
-    Raises:
-        MissingInputError: no dataset there.
-        DataError: at least one is damaged; the others are still checked and reported.
+    Raise MissingInputError without any, and DataError for the first damaged one, after all of them.
     """
     wanted = list(paths) or [
         ROOT / name for name in files.list_names(ROOT) if (ROOT / name / MANIFEST).exists()
@@ -81,7 +73,10 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
         screen.table(
             f"{path}: intact, sha256 {data.digest}",
             ["split", *labels(data.plant)],
-            [[name, *map(interval, values)] for name, values in ranges.items()],
+            [
+                [name, *(f"{least:.3g} … {most:.3g}" for least, most in spans)]
+                for name, spans in ranges.items()
+            ],
         )
     for further in damaged[1:]:
         screen.say(further.message)
@@ -95,60 +90,42 @@ def preview(
 ) -> Result:
     """Draw a contact sheet: one trajectory per row, time from left to right.
 
-    Raises:
-        UsageError: no PNG file.
-        MissingInputError: no dataset, or no Pillow.
-        DataError: the dataset is damaged.
+    Raise UsageError for another file than a PNG, MissingInputError without a dataset or Pillow, and
+    DataError for a damaged dataset.
     """
-    try:
-        from hjepa_cli.output import pictures
-    except ModuleNotFoundError as missing:
-        if missing.name != "PIL":
-            raise
-        raise MissingInputError(
-            "a preview needs Pillow, which is not installed", hint='pip install "hjepa[plot]"'
-        ) from None
+    require("PIL", "a preview needs Pillow", "plot")
+    from hjepa_cli.output import pictures
+
     if out is not None and out.suffix != ".png":
         raise UsageError(f"a preview is a PNG file, not '{out.suffix}'; --out FILE.png")
-    data = opened(path, screen)
+    data = open_dataset(path, screen)
     recorded = data.split(split)[:rows]
     steps = np.linspace(0, recorded.steps - 1, min(columns, recorded.steps)).round().astype(int)
-    shown = recorded.states[:, steps + 1]
-    if recorded.frames is not None:
-        frames = recorded.frames[:, steps + 1]
+    if recorded.frames is None:
+        frames = frames_of(plant(data.plant).camera(), recorded.states[:, steps + 1])
     else:
-        images = plant(data.plant).camera().render(shown.reshape(-1, shown.shape[-1]))
-        frames = images.reshape(*shown.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
+        frames = recorded.frames[:, steps + 1]
     captions = [
         [f"{split} {row}, k {step}, {forces(recorded.applied_n[row, step])}" for step in steps]
         for row in range(len(recorded))
     ]
-    target = out or Path(f"{data.path.name}-{split}.png")
-    files.make_directory(target.parent)
+    target = files.target(out or Path(f"{data.path.name}-{split}.png"))
     pictures.save_png(pictures.contact_sheet(frames, captions), target)
     screen.say(f"{len(recorded)} trajectories of {data.path}: {target}")
     return {"dataset": str(data.path), "split": split, "picture": str(target)}
 
 
 def export(
-    screen: Screen,
-    path: Path | None,
-    out: Path | None,
-    split: str,
-    kind: str | None,
-    pixels: bool,
+    screen: Screen, path: Path | None, out: Path | None, split: str, kind: str | None, pixels: bool
 ) -> Result:
     """Write one split for other programs; see :mod:`hjepa_cli.core.datasets.exports`.
 
-    Raises:
-        UsageError: no such format.
-        MissingInputError: no dataset, or no h5py.
+    Raise UsageError for another format, and MissingInputError without a dataset or h5py.
     """
     kind = chosen_format(out, kind)
-    data = opened(path, screen)
+    data = open_dataset(path, screen)
     recorded = data.split(split)
-    target = out or default_name(data, split, kind)
-    files.make_directory(target.parent)
+    target = files.target(out or Path(f"{data.path.name}-{split}{FORMATS[kind][0]}"))
     system = plant(data.plant)
     limit_n, camera = system.force_limit_n, system.camera()
     values = exports.columns(recorded, system.teacher()(recorded.states[:, 0]), limit_n)
@@ -156,16 +133,13 @@ def export(
         "dataset": data.digest,
         "plant": data.plant,
         "split": split,
+        "camera": data.camera,
         "force_limit_n": limit_n,
         "step_s": system.step_s,
-        "camera": data.camera,
     }
 
     def film(part: Trajectories) -> np.ndarray:
-        if part.frames is not None:
-            return part.frames
-        images = camera.render(part.states.reshape(-1, part.states.shape[-1]))
-        return images.reshape(*part.states.shape[:2], HEIGHT_PX, WIDTH_PX, 3)
+        return frames_of(camera, part.states) if part.frames is None else part.frames
 
     with screen.progress("export", len(recorded), "trajectories") as bar:
         filmed = exports.blocks(recorded, film, bar.advance) if pixels else None
@@ -175,22 +149,21 @@ def export(
             exports.write_hdf5(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
         else:
             exports.write_npz(target, values, filmed, about)
-    size_bytes = target.stat().st_size
-    names = [*values, *(["pixels"] if pixels else [])]
-    screen.say(f"{len(recorded)} trajectories, {', '.join(sorted(names))}: {target}")
+    names = sorted([*values, *(["pixels"] if pixels else [])])
+    screen.say(f"{len(recorded)} trajectories, {', '.join(names)}: {target}")
     return {
         "dataset": str(data.path),
         "split": split,
         "file": str(target),
         "format": kind,
         "rows": len(values["state"]),
-        "columns": sorted(names),
-        "size_bytes": size_bytes,
+        "columns": names,
+        "size_bytes": target.stat().st_size,
     }
 
 
-def opened(path: Path | None, screen: Screen) -> Dataset:
-    """The dataset at ``path``, or the newest in data/."""
+def open_dataset(path: Path | None, screen: Screen) -> Dataset:
+    """Open the dataset at ``path``, or the newest in data/."""
     if path is None:
         path = newest()
         screen.say(f"newest dataset, {path}")
@@ -198,7 +171,7 @@ def opened(path: Path | None, screen: Screen) -> Dataset:
 
 
 def newest() -> Path:
-    """The newest dataset in data/."""
+    """Return the newest dataset in data/. Raises MissingInputError where there is none."""
     path = find_newest_dataset(ROOT)
     if path is None:
         raise MissingInputError(f"no dataset in {ROOT}/", hint="hjepa collect")
@@ -206,7 +179,7 @@ def newest() -> Path:
 
 
 def summary(data: Dataset) -> Result:
-    """What the manifest says."""
+    """Return what the manifest says."""
     return {
         "dataset": str(data.path),
         "plant": data.plant,
@@ -214,25 +187,22 @@ def summary(data: Dataset) -> Result:
         "sha256": data.digest,
         "size_bytes": sum(file.stat().st_size for file in data.path.glob("*") if file.is_file()),
         "splits": {
-            name: {
-                "trajectories": split["trajectories"],
-                "steps": split["steps"],
-                "shards": len(split["shards"]),
-            }
-            for name, split in data.splits.items()
+            name: {key: of[key] for key in ("trajectories", "steps")}
+            | {"shards": len(of["shards"])}
+            for name, of in data.splits.items()
         },
     }
 
 
 def spread(split: Trajectories) -> list[list[float]]:
-    """[least, greatest] of each state and of each applied force."""
+    """Return [least, greatest] of each state and of each applied force."""
     driven = split.applied_n.reshape(len(split), split.steps, -1)
     series = [*np.moveaxis(split.states, -1, 0), *np.moveaxis(driven, -1, 0)]
     return [[float(values.min()), float(values.max())] for values in series]
 
 
 def labels(plant_name: str) -> list[str]:
-    """What :func:`spread` is of: ``x [m]``, …, ``force [N]``."""
+    """Return the names of what :func:`spread` is of: ``x [m]``, …, ``force [N]``."""
     system = plant(plant_name)
     states = zip(system.state_names, system.state_units, strict=True)
     count = math.prod(system.action_shape)
@@ -241,20 +211,14 @@ def labels(plant_name: str) -> list[str]:
 
 
 def forces(applied_n: np.ndarray) -> str:
-    """``+1.5 N``, or ``+0.2 -0.1 N`` where there are several."""
+    """Return a step's forces as ``+1.5 N``, or ``+0.2 -0.1 N`` where there are several forces."""
     return " ".join(f"{force:+.1f}" for force in applied_n.reshape(-1)) + " N"
 
 
-def interval(ends: Sequence[float]) -> str:
-    """``-0.31 … 0.28``."""
-    return " … ".join(f"{end:.3g}" for end in ends)
-
-
 def chosen_format(out: Path | None, kind: str | None) -> str:
-    """The format that was named, else that of the file's suffix, else npz.
+    """Return the format that was named, else that of the file's suffix, else npz.
 
-    Raises:
-        UsageError: the suffix is that of no format, or of another than the one that was named.
+    Raise UsageError where the suffix is of no format, or of another than the one that was named.
     """
     if out is None:
         return kind or "npz"
@@ -275,7 +239,7 @@ def chosen_format(out: Path | None, kind: str | None) -> str:
 def plan_export(
     path: Path | None, out: Path | None, split: str, kind: str | None, pixels: bool
 ) -> Plan:
-    """Plan of ``hjepa data export``."""
+    """Plan ``hjepa data export``; arguments as of :func:`export`."""
     kind = chosen_format(out, kind)
     data = load_dataset(path or newest())
     described = data.splits[split]
@@ -286,16 +250,12 @@ def plan_export(
     work = [f"gather {rows} rows of split {split}"]
     if frames and data.frames == "rendered":
         work.append(f"render {frames} frames")
+    target = out or Path(f"{data.path.name}-{split}{FORMATS[kind][0]}")
     return Plan(
         command="data export",
         reads=[f"dataset {data.path}"],
         work=work,
-        writes=[f"{kind} file {out or default_name(data, split, kind)}"],
+        writes=[f"{kind} file {target}"],
         writes_bytes=rows * row_bytes + frames * COMPRESSED_FRAME_BYTES,
-        seconds=1 + frames / RATES_PER_S["rendered frames"] + frames / COMPRESSED_FRAMES_PER_S,
+        seconds=1 + seconds_of({"rendered frames": frames, "exported frames": frames}),
     )
-
-
-def default_name(data: Dataset, split: str, kind: str) -> Path:
-    """Where an export goes without --out."""
-    return Path(f"{data.path.name}-{split}{FORMATS[kind][0]}")

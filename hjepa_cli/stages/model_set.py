@@ -1,4 +1,4 @@
-"""What ``eval`` and ``scale`` measure: a trained model for each method, found wherever it is.
+"""The models that ``eval`` and ``scale`` measure: one for each method, found wherever it is.
 
 The model that the user names, or the newest run's, or the zoo's, comes first. A method that it does
 not hold is looked for in the other runs of the plant, newest first, and in the zoo.
@@ -6,19 +6,22 @@ not hold is looked for in the other runs of the plant, newest first, and in the 
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.config.checks import ANCHORS, RAW_FRAMES, REFLEXES, TRUE_STATE, split_late
-from hjepa_cli.config.settings import Settings
+from hjepa_cli.config.checks import needs_model, split_late, without_model
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.drivers import methods_of, offered_methods
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.workers import ModelFile
-from hjepa_cli.core.networks.model import Model, offered
+from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant, plant_of
-from hjepa_cli.errors import DataError, HjepaError, MissingInputError
+from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.inputs import open_dataset
 from hjepa_cli.storage import runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
@@ -28,13 +31,11 @@ TRAINING = ("train-encoder", "train-hierarchy", "train-reflex")
 
 
 @dataclasses.dataclass(frozen=True)
-class Subject:
-    """What is evaluated: a model, if there is one, and the rollouts its NMAE is taken on.
+class ModelSet:
+    """A model to be evaluated, if there is one, those beside it, and the rollouts of its NMAE.
 
     Attributes:
-        settings: plant, seed, protocol.
-        model: ``None`` when only true-state methods can be measured.
-        path: the model's file.
+        model: ``None`` when only true-state methods can be measured; ``path`` is its file.
         dataset: whose clean rollouts to use; ``None`` makes them again from the settings.
         further: of other models, for methods that this one does not hold.
     """
@@ -43,51 +44,65 @@ class Subject:
     model: Model | None
     path: Path | None
     dataset: Dataset | None
-    further: tuple["Subject", ...] = ()
+    further: tuple["ModelSet", ...] = ()
 
     @property
     def name(self) -> str:
-        """The models' paths, for people."""
+        """Return the models' paths, for people."""
         return ", ".join(str(one.path) for one in (self, *self.further) if one.path) or "no model"
 
     @property
     def file(self) -> ModelFile | None:
-        """The model as workers load it."""
+        """Return the model as workers load it."""
         if self.model is None:
             return None
         path = self.path or Path(self.model.digest)
         return ModelFile(path.absolute(), self.model.digest, self.model)
 
     @property
+    def held(self) -> tuple[str, ...]:
+        """Return the methods that the first model offers."""
+        return methods_of(self.model) if self.model else ()
+
+    @property
     def methods(self) -> tuple[str, ...]:
-        """All methods that can be measured."""
-        held = [name for one in (self, *self.further) if one.model for name in one.model.methods]
-        return tuple(dict.fromkeys([*held, *TRUE_STATE]))
+        """Return all methods that can be measured."""
+        held = [name for one in (self, *self.further) for name in one.held]
+        return tuple(dict.fromkeys([*held, *without_model()]))
 
     def measurable(self, methods: Sequence[str]) -> list[str]:
-        """Those of ``methods`` that can be measured, in their order."""
+        """Return those of ``methods`` that can be measured, in their order."""
         return [name for name in methods if name in self.methods]
 
-    def of(self, method: str) -> "Subject":
-        """Whose model holds a method, on time or late; this one for methods on the true state."""
-        name, _ = split_late(method)
-        holders = (one for one in (self, *self.further) if one.model and name in one.model.methods)
-        return next(holders, self)
+    def skipped(self, methods: Sequence[str]) -> dict[str, str]:
+        """Return the methods without a model, with what would train it."""
+        missing = [name for name in methods if name not in self.methods]
+        return {name: how_to_train(name, self.settings) for name in missing}
 
-    def shared_out(self, methods: Iterable[str]) -> list[tuple["Subject", list[str]]]:
-        """Methods by the subject that holds them."""
-        shares: dict[Path | None, tuple[Subject, list[str]]] = {}
+    def say_skipped(self, methods: Sequence[str], screen: Screen) -> None:
+        """Tell the user about them."""
+        for name, how in self.skipped(methods).items():
+            screen.say(f"{name} skipped, no model of it here: {how}")
+
+    def of(self, method: str) -> "ModelSet":
+        """Return the set whose first model holds a method, on time or late; else this one."""
+        name, _ = split_late(method)
+        return next((one for one in (self, *self.further) if name in one.held), self)
+
+    def shared_out(self, methods: Iterable[str]) -> list[tuple["ModelSet", list[str]]]:
+        """Share methods out to those that hold them."""
+        shares: dict[Path | None, tuple[ModelSet, list[str]]] = {}
         for name in methods:
             holder = self.of(name)
             shares.setdefault(holder.path, (holder, []))[1].append(name)
         return list(shares.values())
 
     def training_seeds(self, methods: Iterable[str]) -> dict[str, int | None]:
-        """The seed that the model of each method was trained with, ``None`` if it does not say.
+        """Return the seed of each method's training, ``None`` if its model does not say.
 
         Methods without a model are left out.
         """
-        holders = {name: self.of(name).model for name in methods if name not in TRUE_STATE}
+        holders = {name: self.of(name).model for name in methods if needs_model(name)}
         return {name: model.metadata.get("seed") for name, model in holders.items() if model}
 
     def check_one_training_seed(self) -> None:
@@ -103,22 +118,16 @@ class Subject:
 
     @property
     def digest(self) -> Digest:
-        """What curves must have been measured with to be this subject's."""
-        return Digest.of(
-            self.model.digest if self.model else None,
-            self.settings,
-            self.dataset.settings if self.dataset else None,
-        )
+        """Return the digest that this model's curves are measured under."""
+        digest = self.model.digest if self.model else None
+        return Digest.of(digest, self.settings, self.dataset.settings if self.dataset else None)
 
     def inputs(self, **flags: bool) -> dict[str, Any]:
-        """What a run of this subject was given, for :meth:`Run.create`."""
+        """Return what a run of these models was given, for :meth:`Run.create`."""
         given: dict[str, Any] = dict(flags)
-        models = [
-            "checkpoint",
-            *(f"checkpoint {number + 2}" for number in range(len(self.further))),
-        ]
-        for key, one in zip(models, (self, *self.further), strict=True):
+        for number, one in enumerate((self, *self.further), start=1):
             if one.model and one.path:
+                key = "checkpoint" if number == 1 else f"checkpoint {number}"
                 given[key] = runs.describe_input(one.path, one.model.digest)
         if self.dataset:
             given["dataset"] = runs.describe_input(self.dataset.path, self.dataset.digest)
@@ -126,46 +135,23 @@ class Subject:
 
     @property
     def beside(self) -> list[Path]:
-        """Where the model's own curves are; the zoo's are never written, a run's are."""
+        """Return the file of the model's own curves; the zoo's is never written, a run's is."""
         return [self.path.with_name(CURVES_FILE)] if self.path else []
 
-    def skipped(self, methods: Sequence[str]) -> dict[str, str]:
-        """The methods without a model, with what would train it."""
-        missing = [name for name in methods if name not in self.methods]
-        return {name: how_to_train(name, self.settings) for name in missing}
 
-    def check_any(self, methods: Sequence[str]) -> None:
-        """Check that there is a model of at least one of them.
-
-        Raises:
-            MissingInputError: naming all of them, and what trains the first.
-        """
-        skipped = self.skipped(methods)
-        if len(skipped) == len(methods):
-            raise MissingInputError(
-                f"no model for {', '.join(skipped)}", hint=next(iter(skipped.values()))
-            )
-
-    def say_skipped(self, methods: Sequence[str], screen: Screen) -> None:
-        """Tell the user about them."""
-        for name, how in self.skipped(methods).items():
-            screen.say(f"{name} skipped, no model of it here: {how}")
-
-
-def open_subject(
+def open_model_set(
     settings: Settings,
     screen: Screen,
-    checkpoint: str | None,
+    checkpoint: str | Path | None,
     dataset: Path | None,
     further: Sequence[Path] | None = None,
     *,
     one_seed: bool = False,
-) -> Subject:
+) -> ModelSet:
     """Load what is to be evaluated, and say which models they are where the user did not.
 
     Args:
         settings: plant, seed, protocol and the methods to find models for.
-        screen: where to say so.
         checkpoint: zoo name, run directory or file of the first model.
         dataset: whose clean rollouts to use.
         further: models of the other methods; ``None`` looks for them.
@@ -183,48 +169,31 @@ def open_subject(
             hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
         )
     data = open_dataset(dataset, settings) if dataset else None
-    held = (*(model.methods if model else ()), *TRUE_STATE)
-    lacking = [name for name in settings.methods if name not in held]
+    first = ModelSet(settings, model, path, data)
     if further is None:
         seed = model.metadata.get("seed") if one_seed and model else None
-        further = _find(lacking, settings, screen, seed) if lacking else []
-    others = tuple(
-        Subject(settings, Model.load(other, settings.device), other, data) for other in further
-    )
-    for other in others:
-        if model and other.model and not on_one_encoder(model, other.model):
+        lacking = first.skipped(settings.methods)
+        further = _find([*lacking], settings, screen, seed) if lacking else []
+    others = []
+    for one in further:
+        other = Model.load(one, settings.device)
+        others.append(ModelSet(settings, other, one, data))
+        encoder = other.metadata.get("encoder")  # models on raw frames need none
+        if model and encoder not in (None, model.digest, model.metadata.get("encoder")):
             screen.say(
-                f"{other.path} is on another encoder than {path}: trainings are compared, not "
-                f"methods; {how_to_train(other.model.methods[0], settings)} trains it on this one"
+                f"{one} is on another encoder than {path}: trainings are compared, not "
+                f"methods; {how_to_train(methods_of(other)[0], settings)} trains it on this one"
             )
-    return Subject(settings, model, path, data, others)
-
-
-def on_one_encoder(first: Model, other: Model) -> bool:
-    """Whether two models say that they have one encoder; those on raw frames need none."""
-    theirs = other.metadata.get("encoder")
-    return theirs in (None, first.digest, first.metadata.get("encoder"))
+    return dataclasses.replace(first, further=tuple(others))
 
 
 def how_to_train(method: str, settings: Settings) -> str:
-    """The command that trains the model of a method."""
-    if method not in RAW_FRAMES:
-        train = "hjepa train-reflex" if method in REFLEXES else "hjepa train-hierarchy"
-    else:
-        kind, frames = method.split("-")
-        train = f"hjepa train-encoder --method {kind}"
-        train += f" --frames {frames}" if frames != "2" else ""
-    if settings.preset != "default":
-        train += f" --preset {settings.preset}"
-    if method.startswith("ts-jepa-") and method != "ts-jepa-1":
-        return f"{train} --h {method.removeprefix('ts-jepa-')}"
-    if method in ANCHORS and len(plant(settings.plant).state_names) != 4:
-        return f"{method} is for plants of four states"
-    return train
+    """Return the command that trains the model of a method, on time or late."""
+    return str(METHODS[split_late(method)[0]].trained_by(settings))
 
 
 def default_model(settings: Settings, screen: Screen) -> Path | None:
-    """The newest finished run of the plant, one with a hierarchy before one without, or the zoo's.
+    """Return the plant's newest finished run, one with a hierarchy before others, or the zoo's.
 
     Of the zoo the model with the settings' strides, if there is one.
     """
@@ -249,39 +218,25 @@ def default_model(settings: Settings, screen: Screen) -> Path | None:
 
 
 def _find(
-    methods: Sequence[str], settings: Settings, screen: Screen, seed: int | None
+    missing: Sequence[str], settings: Settings, screen: Screen, seed: int | None
 ) -> list[Path]:
-    """A model for each method that has one: of the newest run, else of the zoo.
+    """Return a model for each method that has one: of the newest run, else of the zoo.
 
     With a ``seed`` only models that were trained with it.
     """
-    missing, found = list(methods), []
-    for path in _candidates():
+    trained = (directory / MODEL_FILE for directory in runs.finished_runs(*TRAINING))
+    published = map(zoo.resolve_model, zoo.list_models())
+    found = []
+    for path in itertools.chain(filter(Path.is_file, trained), published):
         if not missing:
             break
-        held = _held(path, settings.plant, seed)
+        held: tuple[str, ...] = ()
+        with contextlib.suppress(HjepaError, KeyError, TypeError):  # damaged ones hold nothing
+            metadata = load_checkpoint(path).metadata
+            if metadata["plant"] == settings.plant and seed in (None, metadata.get("seed")):
+                held = offered_methods(metadata["architecture"], plant(settings.plant))
         if taken := [name for name in missing if name in held]:
             found.append(path)
             screen.say(f"{', '.join(taken)}: model {path}")
             missing = [name for name in missing if name not in held]
     return found
-
-
-def _candidates() -> Iterator[Path]:
-    """The models of all finished training runs below ``runs/``, newest first; then the zoo's."""
-    for directory in runs.finished_runs(*TRAINING):
-        if (directory / MODEL_FILE).is_file():
-            yield directory / MODEL_FILE
-    yield from map(zoo.resolve_model, zoo.list_models())
-
-
-def _held(path: Path, plant_name: str, seed: int | None) -> tuple[str, ...]:
-    """The methods that a checkpoint offers to a plant.
-
-    None if it is damaged, of another plant, or not trained with the ``seed`` that is asked for.
-    """
-    with contextlib.suppress(HjepaError, KeyError, TypeError):
-        metadata = load_checkpoint(path).metadata
-        if metadata["plant"] == plant_name and seed in (None, metadata.get("seed")):
-            return offered(metadata["architecture"], len(plant(plant_name).state_names))
-    return ()

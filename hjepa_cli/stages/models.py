@@ -2,12 +2,16 @@
 
 from typing import Any
 
-from hjepa_cli.config.settings import PRESETS, dotted, load_settings
+from hjepa_cli.config.schema import dotted
+from hjepa_cli.config.settings import PRESETS, load_settings
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.storage.zoo import CURVES_FILE, ZooModel, list_models, verify_model
 
 Result = dict[str, Any]
+
+ALL_MEASURED = "its curves are those of the default protocol and methods"
+SECTIONS = ("architecture", "health", "versions")  # of a model's metadata
 
 
 def show_list(screen: Screen) -> Result:
@@ -32,36 +36,27 @@ def show_list(screen: Screen) -> Result:
 def show_info(screen: Screen, name_or_path: str) -> Result:
     """Describe one model: what it is, how it was trained, how healthy it is.
 
-    Raises:
-        MissingInputError: no such model.
-        DataError: it is damaged.
+    Raise MissingInputError or DataError.
     """
     model = verify_model(name_or_path)
     metadata = model.metadata
-    rows: list[list[object]] = [[key, value] for key, value in dotted(_summary(model)).items()]
-    for key in ("stage", "seed", "dataset", "encoder"):
-        if key in metadata:
-            rows.append([key, metadata[key]])
-    for section in ("architecture", "health", "versions"):
-        found = metadata.get(section)
-        if isinstance(found, dict):
-            rows += [[f"{section}.{key}", value] for key, value in dotted(found).items()]
-    screen.table(f"Model {model.name}", ["", "value"], rows)
+    plain = {
+        key: metadata[key] for key in ("stage", "seed", "dataset", "encoder") if key in metadata
+    }
+    sections = {key: metadata[key] for key in SECTIONS if isinstance(metadata.get(key), dict)}
+    described = dotted(_summary(model)) | plain | dotted(sections)
+    screen.table(f"Model {model.name}", ["", "value"], list(described.items()))
     return {**_summary(model), "metadata": metadata}
 
 
 def verify(screen: Screen, names: list[str]) -> Result:
     """Check models against their sha256, all of the zoo if none is named.
 
-    Also says whether the measured curves beside a model are those of the present defaults, which
-    ``eval`` and ``scale`` would otherwise measure again.
-
-    Raises:
-        MissingInputError: no such model.
-        DataError: at least one is damaged; the others are still checked and reported.
+    Say as well whether the measured curves beside a model are those of the present defaults, which
+    ``eval`` and ``scale`` would otherwise measure again. Raise MissingInputError without a model,
+    and DataError for the first damaged one, after all of them.
     """
-    damaged = []
-    verified = []
+    damaged, verified = [], []
     for name in names or list_models():
         try:
             model = verify_model(name)
@@ -70,7 +65,10 @@ def verify(screen: Screen, names: list[str]) -> Result:
             damaged.append(error)
         else:
             verified.append(_summary(model) | {"missing_curves": missing})
-            screen.result(f"{name}: intact, sha256 {model.digest}{_told(missing)}")
+            about = "" if missing is None else f"; {ALL_MEASURED}"
+            if missing:
+                about = f"; default curves to be measured again: {', '.join(missing)}"
+            screen.result(f"{name}: intact, sha256 {model.digest}{about}")
     for further in damaged[1:]:
         screen.say(further.message)
     if damaged:
@@ -79,34 +77,25 @@ def verify(screen: Screen, names: list[str]) -> Result:
 
 
 def missing_curves(model: ZooModel) -> list[str]:
-    """The default methods that ``curves.json`` does not hold under the default protocol.
+    """Return the default methods that ``curves.json`` lacks under the default protocol.
 
-    Of a baseline, which holds none of them, the method that it was trained for.
-
-    Raises:
-        DataError: not a model that can drive, or damaged curves.
+    A baseline holds none of them: of it, the method counts that it was trained for. Raise DataError
+    for damaged curves or a model that cannot drive.
     """
+    # These import torch: seconds that the other commands need not wait.
+    from hjepa_cli.core.control.drivers import methods_of
     from hjepa_cli.core.evaluation import curves
-    from hjepa_cli.core.networks.model import (
-        Model,  # torch: seconds that the other commands need not wait
-    )
-    from hjepa_cli.stages.model_set import Subject
+    from hjepa_cli.core.networks.model import Model
+    from hjepa_cli.stages.model_set import ModelSet
 
     plant = model.metadata.get("plant")
     settings = load_settings(plant if plant in PRESETS else None)
     held = Model.load(model.path)
-    subject = Subject(settings, held, model.path, None)
-    wanted = settings.methods if "hjepa" in held.methods else held.methods[:1]
-    found = curves.read(model.path.with_name(CURVES_FILE), subject.digest)
-    return [name for name in subject.measurable(wanted) if name not in found]
-
-
-def _told(missing: list[str] | None) -> str:
-    if missing is None:
-        return ""
-    if not missing:
-        return "; its curves are those of the default protocol and methods"
-    return f"; default curves to be measured again: {', '.join(missing)}"
+    models = ModelSet(settings, held, model.path, None)
+    offered = methods_of(held)
+    wanted = settings.methods if "hjepa" in offered else offered[:1]
+    found = curves.read(model.path.with_name(CURVES_FILE), models.digest, named=True)
+    return [name for name in models.measurable(wanted) if name not in found]
 
 
 def _summary(model: ZooModel) -> Result:
@@ -132,9 +121,7 @@ def _row(model: Result) -> list[object]:
     strides = "/".join(str(stride) for stride in model["strides"].values() if stride is not None)
     if model["kind"] == "flat":  # one level: its m and l are not there
         strides = str(model["strides"]["h"])
-    megabytes = f"{model['size_bytes'] / 1e6:.1f}"
     curves = "measured" if model["curves"] else "none"
-    return [
-        model["name"], model["kind"], model["plant"], strides, megabytes, curves,
-        model["sha256"][:12],
-    ]  # fmt: skip
+    size = f"{model['size_bytes'] / 1e6:.1f}"
+    named = [model[key] for key in ("name", "kind", "plant")]
+    return [*named, strides, size, curves, model["sha256"][:12]]

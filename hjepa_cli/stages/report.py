@@ -4,6 +4,7 @@ Run directories → per run its result with intervals, its figures, its settings
 the commands that make it again. Figures can also be written as files for a paper.
 """
 
+import base64
 import csv
 import io
 import shlex
@@ -11,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, UndefinedError
+
 from hjepa_cli import __version__
-from hjepa_cli.core.evaluation.protocol import BESIDE
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.output import html
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
 from hjepa_cli.storage import files, runs
 
@@ -24,7 +25,7 @@ Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
 STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale")
-FIGURE_FORMATS = ("pdf", "svg", "png")
+MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 SMOKE = "smoke"
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
 
@@ -37,32 +38,34 @@ def run(
     figures: Path | None = None,
     formats: Sequence[str] = ("pdf",),
 ) -> Result:
-    """Write the report; returns the document of ``--json``.
+    """Write the report; return the document of ``--json``.
 
     Args:
-        screen: where to say so.
+        screen: says what was written.
         paths: run directories, or directories that hold some; none: the newest of each stage.
         out: the HTML file.
-        figures: also write every figure into this directory.
-        formats: of these figures.
+        figures, formats: a directory to write every figure into as well, and how.
 
-    Raises:
-        MissingInputError: no run there, or an unfinished one.
-        DataError: a damaged run.
+    Raise MissingInputError without a finished run, and DataError for a damaged one.
     """
     directories = found_runs(paths)
-    parts = [html.heading(1, "hjepa report"), html.paragraph(f"Written by hjepa {__version__}.")]
-    parts.append(contents(directories))
-    if any(runs.read_environment(directory)["preset"] == SMOKE for directory in directories):
-        parts.append(html.paragraph(f"{NO_RESULT}.", note=True))
-    written: list[Path] = []
+    template = page_template()
+    section = template.make_module(dict.fromkeys(("runs", "sections", "note"), ())).section
+    described, sections, written = [], [], []
     for directory in directories:
-        section, drawn = describe(directory, screen)
-        parts += section
+        one = describe(directory)
+        try:
+            drawn = draw(one, directory, screen)
+            one["figures"] = [(text, _svg(figure)) for text, figure in drawn.values()]
+            sections.append(section(one))
+        except (UndefinedError, KeyError, TypeError, IndexError, AttributeError) as error:
+            raise damaged(directory, error) from None
+        described.append(one)
         if figures is not None:
-            written += write_figures(drawn, figures, stage_of(directory), formats)
-    files.make_directory(out.parent)
-    files.write_text(out, html.page("hjepa report", parts))
+            written += write_figures(drawn, figures, one["stage"], formats)
+    note = NO_RESULT if any(one["preset"] == SMOKE for one in described) else ""
+    text = template.render(runs=described, sections=sections, note=note)
+    files.write_text(files.target(out), text)
     if figures is not None:
         screen.say(f"{len(written)} figures in {figures}")
     screen.say(f"written: {out}")
@@ -70,14 +73,10 @@ def run(
 
 
 def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") -> list[Path]:
-    """The finished runs among and below ``paths``, in the order of the pipeline.
+    """Return the finished runs among and below ``paths``, in reverse order of the pipeline.
 
-    Args:
-        paths: of runs or of directories that hold some; none: the newest run of each stage.
-        made_by: the commands to suggest where there is none.
-
-    Raises:
-        MissingInputError: none there.
+    Without paths they are the newest of each stage. Raise MissingInputError, suggesting the
+    commands ``made_by``, where there is none.
     """
     found: list[Path] = []
     for path in paths:
@@ -102,57 +101,59 @@ def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") 
     return sorted(known, key=lambda directory: -STAGES.index(stage_of(directory)))
 
 
-def contents(directories: Sequence[Path]) -> str:
-    """What the report holds."""
-    rows = []
-    for directory in directories:
-        config = runs.read_config(directory)
-        rows.append([stage_of(directory), str(directory), config["plant"], config["seed"]])
-    return html.table(["stage", "run", "plant", "seed"], rows)
+def page_template() -> Template:
+    """Return ``report.html.j2``; what a run lacks is an error there, never an empty place."""
+    environment = Environment(
+        loader=PackageLoader("hjepa_cli", "output"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "described_steps": described_steps,
+        "devices": lambda row: span(
+            row["devices"], row["devices_ci95"], 0, "≥" if row["at_least"] else ""
+        ),
+        "fixed": lambda value, decimals: None if value is None else f"{value:.{decimals}f}",
+        "percent": percent,
+        "sprintf": lambda value, text: text % value,
+    }
+    named = (gates, in_order, ranked, span, tolerance, windows)
+    environment.globals |= {one.__name__: one for one in named} | {"version": __version__}
+    return environment.get_template("report.html.j2")
 
 
-def describe(directory: Path, screen: Screen) -> tuple[list[str], Figures]:
-    """One run as a section of HTML, and its figures."""
-    stage = stage_of(directory)
-    result, config = runs.read_result(directory), runs.read_config(directory)
-    environment = runs.read_environment(directory)
-    parts = [html.heading(2, f"{stage}: {directory}")]
-    made_by = runs.version_of(environment)
-    if made_by != __version__:
-        again = f"hjepa {stage} --config {directory / runs.CONFIG}"
-        parts.append(
-            html.paragraph(
-                f"made by hjepa {made_by}, this is {__version__}; numbers may differ. "
-                f"To measure it again: {again}",
-                note=True,
-            )
-        )
-    section, figures_of = SECTIONS[stage]
-    try:
-        parts += section(result, config)
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise DataError(
-            f"{directory / runs.RESULT} lacks what a {stage} run has: {error}",
-            hint=f"hjepa {stage} --config {directory / runs.CONFIG}",
-        ) from None
-    drawn = draw(lambda: figures_of(result, config, directory), screen)
-    parts += [html.picture(svg(figure), "svg+xml", caption) for caption, figure in drawn.values()]
-    parts.append(html.heading(3, "Made by"))
-    command = ["hjepa", *map(str, environment.get("command", [])[1:])]
-    again = ["hjepa", stage, "--config", str(directory / runs.CONFIG), *inputs_of(environment)]
-    text = "# as it was typed\n" + shlex.join(command)
-    text += "\n# this stage again, with the same settings and inputs\n" + shlex.join(again)
-    parts.append(html.code(text))
+def describe(directory: Path) -> dict[str, Any]:
+    """Return what the page says of a run. Raises DataError or MissingInputError."""
+    environment, stage = runs.read_environment(directory), stage_of(directory)
+    config = directory / runs.CONFIG
     versions = {f"version of {name}": v for name, v in environment.get("versions", {}).items()}
-    machine = {key: environment.get(key) for key in ("system", "machine", "cpus")}
-    parts.append(html.details("Environment", html.pairs(versions | machine)))
-    toml = files.read_bytes(directory / runs.CONFIG, limit=files.JSON_LIMIT_BYTES).decode()
-    parts.append(html.details("Settings", html.code(toml)))
-    return parts, drawn
+    return {
+        "stage": stage,
+        "directory": directory,
+        "preset": environment["preset"],
+        "made_by": runs.version_of(environment),
+        "result": runs.read_result(directory),
+        "config": runs.read_config(directory),
+        "command": shlex.join(["hjepa", *map(str, environment.get("command", [])[1:])]),
+        "again": shlex.join(["hjepa", stage, "--config", str(config), *inputs_of(environment)]),
+        "environment": versions | {key: environment.get(key) for key in MACHINE},
+        "toml": files.read_bytes(config, limit=files.JSON_LIMIT_BYTES).decode(),
+    }
+
+
+def damaged(directory: Path, error: Exception) -> DataError:
+    """Return the error of a result that lacks what its stage writes."""
+    stage, missing = stage_of(directory), str(error).rpartition("has no attribute ")[2]
+    return DataError(
+        f"{directory / runs.RESULT} lacks what a {stage} run has: {missing}",
+        hint=f"hjepa {stage} --config {directory / runs.CONFIG}",
+    )
 
 
 def inputs_of(environment: Mapping[str, Any]) -> list[str]:
-    """What a run was given, as flags; paths below this directory without it.
+    """Return what a run was given as flags; paths below this directory without it.
 
     Further models (``checkpoint 2``) have no flag: the command finds them again.
     """
@@ -166,14 +167,14 @@ def inputs_of(environment: Mapping[str, Any]) -> list[str]:
 
 
 def stage_of(directory: Path) -> str:
-    """Which command made a run. Raises DataError where it does not say."""
+    """Return the command that made a run. Raises DataError where it does not say."""
     return str(runs.read_environment(directory)["stage"])
 
 
-def draw(figures_of: Callable[[], Figures], screen: Screen) -> Figures:
-    """The figures, or none without matplotlib."""
+def draw(described: Mapping[str, Any], directory: Path, screen: Screen) -> Figures:
+    """Return the figures of a run, or none without matplotlib."""
     try:
-        return figures_of()
+        return FIGURES[described["stage"]](described["result"], described["config"], directory)
     except ModuleNotFoundError as missing:
         if not (missing.name or "").startswith("matplotlib"):
             raise
@@ -181,11 +182,10 @@ def draw(figures_of: Callable[[], Figures], screen: Screen) -> Figures:
         return {}
 
 
-def svg(figure: Any) -> bytes:
-    """A figure as SVG, equal bytes for equal figures."""
+def _svg(figure: Any) -> str:
     from hjepa_cli.output.figures import encoded
 
-    return encoded(figure, "svg")
+    return base64.b64encode(encoded(figure, "svg")).decode()
 
 
 def write_figures(
@@ -204,171 +204,29 @@ def write_figures(
     ]
 
 
-# --- one section per stage
-
-
-def encoder_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    """Health and gates."""
+def gates(result: Result, config: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Return the gates of an encoder by name, those of the states first and in their order."""
     states = [f"probe_r2_{name}" for name in plant(config["plant"]).state_names]
-    rows = [
-        [
-            name,
-            gate["value"],
-            f"{'≤' if name == 'actor_nrmse' else '≥'} {gate['threshold']:g}",
-            "passed" if gate["passed"] else "FAILED",
-        ]
-        for name, gate in in_order(result["gates"], states).items()
-    ]
-    return [
-        html.paragraph(f"Encoder {result['checkpoint']}, trained in {result['seconds']:.0f} s."),
-        html.table(["health, held out", "value", "gate", ""], rows),
-    ]
+    return list(in_order(result["gates"], states).items())
 
 
-def hierarchy_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    """Strides and prediction error."""
-    strides = "/".join(str(result["strides"][level]) for level in "hml")
-    return [
-        html.paragraph(
-            f"Hierarchy of strides {strides}, {result['checkpoint']}, trained in "
-            f"{result['seconds']:.0f} s."
-        ),
-        html.table(
-            ["steps since the packet", f"NMAE of {result.get('method', 'hjepa')}"],
-            [[window, float(error)] for window, error in result["nmae_windows"].items()],
-        ),
-    ]
+def windows(errors: Mapping[str, Any]) -> list[str]:
+    """Return headings for errors by method and window of steps."""
+    first = next(iter(errors.values()))
+    return [f"{window} steps" for window in first.get("nmae_windows", first)]
 
 
-def reflex_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    """How the forces of decaying holds fade, and what all reflexes do after one packet."""
-    decays = {"hold-decay": result["reflex"], "hold-decay-linear": result["reflex"]["law"]}
-    windows = list(next(iter(result["nmae_windows"].values())))
-    return [
-        html.paragraph(
-            f"Reflexes, {result['checkpoint']}, trained in {result['seconds']:.0f} s: error of the "
-            f"force (NMAE) by steps since a single packet, {result['n_rollouts']} rollouts; factor "
-            "s and time τ of the forces that fade."
-        ),
-        html.table(
-            ["method", *(f"{window} steps" for window in windows), "s", "τ [steps]"],
-            [
-                [
-                    name,
-                    *(f"{errors[window]:.4f}" for window in windows),
-                    _two_decimals(decays.get(name, {}).get("gain")),
-                    _two_decimals(decays.get(name, {}).get("tau_steps")),
-                ]
-                for name, errors in result["nmae_windows"].items()
-            ],
-        ),
-    ]
-
-
-def _two_decimals(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
-
-
-def eval_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    """Scores and tolerances with their intervals."""
-    entries = in_order(result["methods"], config["methods"])
-    if not entries:
-        return [html.paragraph("No method was measured.")]
-    first = next(iter(entries.values()))
-    tolerances = [
-        [
-            name,
-            span(entry["score"], entry["score_ci95"], 3),
-            f"{entry['lq_ratio']:.3f}",
-            entry["bits_per_transmission"],
-            tolerance(entry, "gap_steps", "gap", 1, "≥"),
-            *(_two_decimals(entry.get(f"tolerance_gap_{key}")) for key in BESIDE),
-            tolerance(entry, "p", "p", 4, "≤"),
-        ]
-        for name, entry in entries.items()
-    ]
-    errors = [
-        [name, *(f"{error:.4f}" for error in entry["nmae_windows"].values())]
-        for name, entry in entries.items()
-    ]
-    windows = [f"{window} steps" for window in first["nmae_windows"]]
-    return [
-        html.paragraph(
-            f"Plant {result['plant']}, seed {result['seed']}, model {result['checkpoint']}. Score "
-            f"and LQ ratio with a packet at every step, {first['n_curve_devices']} devices; "
-            f"tolerances from {first['n_devices']} devices, {described_steps(first)}; beside D* "
-            "the share of steps in the band there, the LQ ratio, and the share of loops lost. In "
-            "brackets: 95 % bootstrap intervals."
-        ),
-        *_models(result),
-        html.table(
-            [
-                *("method", "score", "LQ ratio", "bits"),
-                *("gap D* [steps]", "in band", "LQ ratio", "lost", "delivery p*"),
-            ],
-            tolerances,
-        ),
-        html.paragraph(
-            f"Error of the force (NMAE) by steps since a single packet, {first['n_rollouts']} "
-            "rollouts."
-        ),
-        html.table(["method", *windows], errors),
-    ]
-
-
-def _models(result: Mapping[str, Any]) -> list[str]:
-    """Where methods come from that the first model does not hold."""
-    paths = result.get("checkpoints", {}).items()
-    others = [f"{name}: {path}" for name, path in paths if path != result["checkpoint"]]
-    return [html.paragraph(f"Of other models: {'; '.join(others)}.")] if others else []
-
-
-def scale_section(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    """Device counts with their intervals, and the gains."""
+def ranked(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Mapping[str, Any]]]]:
+    """Return device counts by method, with its scheduler where it has one, the most first."""
     by_method: dict[str, list[Mapping[str, Any]]] = {}
-    for row in result["rows"]:
+    for row in rows:
         names = (row["method"], row.get("scheduler"))
         by_method.setdefault(", ".join(filter(None, names)), []).append(row)
-    grid_db = sorted({row["snr_db"] for row in result["rows"]})
-    ranked = sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
-    rows = [
-        [
-            method,
-            *(
-                span(row["devices"], row["devices_ci95"], 0, "≥" if row["at_least"] else "")
-                for row in found
-            ),
-            None if found[0]["bits_per_s"] is None else f"{found[0]['bits_per_s']:,.0f}",
-        ]
-        for method, found in ranked
-    ]
-    parts = [
-        html.paragraph(
-            f"Devices per cell under law {result['law']}: {result['bandwidth_hz'] / 1e6:g} MHz, "
-            f"slots of {1e3 * result['slot_s']:g} ms, normalised score of at least "
-            f"{result['acceptable_score']:g}; tolerances from {result['n_devices']} simulated "
-            f"devices, seed {result['seed']}. In brackets: 95 % intervals. Least rate that any "
-            f"controller needs: {result['limit_bits_per_s']:.1f} bit/s per device."
-        ),
-        html.table(["method", *(f"{snr:g} dB" for snr in grid_db), "bit/s per device"], rows),
-    ]
-    parts += [html.paragraph(gained(found)) for found in result["gains"] if found["ratio"]]
-    paper = f"The paper: up to +{result['paper_gain_percent']} % over its one-step predictor."
-    parts.append(html.paragraph(paper))
-    return parts
-
-
-def gained(found: Mapping[str, Any]) -> str:
-    """How many more devices a method carries than another."""
-    low, high = found["ratio_ci95"]
-    return (
-        f"{found['method']} over {found['over']} at {found['snr_db']:g} dB: "
-        f"{percent(found['ratio'])} ({percent(low)} to {percent(high)}) devices."
-    )
+    return sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
 
 
 def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
-    """Losses and health over training."""
+    """Draw losses and health over training."""
     path = run / runs.METRICS
     if not path.is_file():
         return {}
@@ -382,43 +240,34 @@ def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
 
 
 def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
-    """Score against gap and delivery, error against the horizon; none that would be empty."""
+    """Draw score against gap and delivery, error against the horizon; none that would be empty."""
     from hjepa_cli.output import figures
 
     entries = in_order(result["methods"], config["methods"])
     step_s = plant(result["plant"]).step_s
-    level = config["protocol"]["acceptable_score"]
+    acceptable = config["protocol"]["acceptable_score"]
     drawn = {
-        "gap": (
-            "Normalised score against the time between packets, 95 % bands",
-            figures.score_figure(entries, "gap", acceptable_score=level, step_s=step_s),
-        ),
-        "delivery": (
-            "Normalised score against the delivery probability, 95 % bands",
-            figures.score_figure(entries, "delivery", acceptable_score=level, step_s=step_s),
-        ),
-        "error": (
-            "Error of the predicted force after a single packet, 95 % bands",
-            figures.error_figure(entries, step_s=step_s),
-        ),
+        kind: (
+            f"Normalised score against the {against}, 95 % bands",
+            figures.score_figure(entries, kind, acceptable_score=acceptable, step_s=step_s),
+        )
+        for kind, against in (("gap", "time between packets"), ("delivery", "delivery probability"))
     }
-    return {
-        name: (text, figure) for name, (text, figure) in drawn.items() if figures.has_curves(figure)
-    }
+    text = "Error of the predicted force after a single packet, 95 % bands"
+    drawn["error"] = text, figures.error_figure(entries, step_s=step_s)
+    return {name: one for name, one in drawn.items() if figures.has_curves(one[1])}
 
 
 def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
-    """Devices against the SNR."""
+    """Draw devices against the SNR."""
     from hjepa_cli.output import figures
 
     caption = f"Supported devices, law {result['law']}, 95 % intervals"
     return {"devices": (caption, figures.scale_figure(result))}
 
 
-SECTIONS: dict[str, tuple[Callable[..., list[str]], Callable[..., Figures]]] = {
-    "train-encoder": (encoder_section, training_figures),
-    "train-hierarchy": (hierarchy_section, training_figures),
-    "train-reflex": (reflex_section, training_figures),
-    "eval": (eval_section, eval_figures),
-    "scale": (scale_section, scale_figures),
+FIGURES: dict[str, Callable[..., Figures]] = {
+    **dict.fromkeys(("train-encoder", "train-hierarchy", "train-reflex"), training_figures),
+    "eval": eval_figures,
+    "scale": scale_figures,
 }

@@ -6,40 +6,34 @@ stage reads what the one before it left in the folder and nothing else; the same
 """
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.config.checks import LINKLESS, TRUE_STATE, check_gaps, check_schedulable
-from hjepa_cli.config.settings import Settings
-from hjepa_cli.core.networks.model import offered
+from hjepa_cli.config.checks import check_cell, check_gaps, check_schedulable, without_model
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.drivers import offered_methods
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import (
-    collect,
-    evaluate,
-    plan,
-    report,
-    scale,
-    train_encoder,
-    train_hierarchy,
-)
+from hjepa_cli.plugins import METHODS, STAGES
+from hjepa_cli.stages import report
 from hjepa_cli.stages.evaluate import check_horizon
-from hjepa_cli.stages.inputs import check_stride
+from hjepa_cli.stages.measuring import seconds_of_curves
 from hjepa_cli.stages.model_set import how_to_train
+from hjepa_cli.stages.plan import Plan, run_directory
+from hjepa_cli.stages.scale import plan_searches
+from hjepa_cli.stages.training import check_stride
 from hjepa_cli.storage.checkpoints import MODEL_FILE
 from hjepa_cli.storage.runs import Run
 
-Result = dict[str, Any]
+MEASURING = ("eval", "scale")  # the stages that drive a model
 
 
-def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Result:
-    """Run the whole pipeline; returns the document of ``--json``.
+def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[str, Any]:
+    """Run the whole pipeline; return the document of ``--json``.
 
-    Raises:
-        As :func:`check` and the stages; what is finished stays.
+    It raises as :func:`check` and the stages; what is finished stays.
     """
     check(settings)
     with Run.create("reproduce", out, settings.as_dict()) as record:
@@ -52,18 +46,67 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> Resul
         for name in left_out(settings):
             how = how_to_train(name, settings)
             screen.say(f"{name} left out, no model of it is trained here: {how}")
-        work = stages(settings, screen, folder)
-        parts = plan.reproduce_parts(settings)
-        expected_s = {name: round(seconds) for name, (_, seconds) in parts.items()}
-        results: Result = {}
+        given = inputs_in(folder)
+        expected_s = {part.command: round(part.seconds) for part in parts(settings)}
+        results: dict[str, Any] = {}
         with screen.progress("all stages", sum(expected_s.values())) as bar:
-            for number, (name, stage) in enumerate(work.items(), start=1):
-                screen.say(f"stage {number} of {len(work)}: {name}")
-                results[name] = stage()
+            for number, (name, inputs) in enumerate(given.items(), start=1):
+                screen.say(f"stage {number} of {len(given)}: {name}")
+                chosen = measured(settings) if name in MEASURING else settings
+                results[name] = STAGES[name].run(chosen, screen, **inputs)
                 record.event("finished", stage=name)
                 bar.advance(expected_s[name])
         made = report.run(screen, [folder], out=folder / "report.html", figures=folder / "figures")
         return record.finish({"folder": folder, **results, "report": made["report"]})
+
+
+def plan(settings: Settings, *, out: Path | None = None) -> Plan:
+    """Plan all stages; all curves are measured, as none can be of a model that is not there yet."""
+    check(settings)
+    planned = parts(settings)
+    return Plan(
+        command="reproduce",
+        reads=[],
+        work=[f"{part.command}: {line}" for part in planned for line in part.work],
+        writes=[f"folder {run_directory('reproduce', out)} with a report and its figures"],
+        writes_bytes=sum(part.writes_bytes for part in planned),
+        seconds=15 + sum(part.seconds for part in planned),
+    )
+
+
+def parts(settings: Settings) -> list[Plan]:
+    """Return the plan of each stage."""
+    methods = measured(settings).methods
+    curves = [f"measure the curves of {', '.join(methods)}"]
+    curves_s = seconds_of_curves(methods, settings.protocol)
+    counting, counting_s = ["count devices"], 0.0
+    if settings.radio.law == "scheduled":
+        linked = [name for name in methods if METHODS[name].needs_link]
+        counting, counting_s = plan_searches(settings, linked)
+    return [
+        *(STAGES[name].plan(settings) for name in ("collect", "train-encoder", "train-hierarchy")),
+        Plan("eval", [], curves, [], 200_000, 5 + curves_s),
+        Plan("scale", [], counting, [], 300_000, 5 + counting_s),
+    ]
+
+
+def inputs_in(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the stages in their order, with what each reads and writes in the folder."""
+    data, encoder, model = (folder / name for name in ("data", "train-encoder", "train-hierarchy"))
+    measured = {"checkpoint": model, "dataset": data}
+    return {
+        "collect": {"out": data},
+        "train-encoder": {"dataset": data, "out": encoder},
+        "train-hierarchy": {"dataset": data, "encoder": encoder / MODEL_FILE, "out": model},
+        **{name: {**measured, "out": folder / name} for name in MEASURING},
+    }
+
+
+def measured(settings: Settings) -> Settings:
+    """Return the settings with those methods only that a model which is trained here drives."""
+    left = left_out(settings)
+    driven = tuple(name for name in settings.methods if name not in left)
+    return dataclasses.replace(settings, methods=driven)
 
 
 def check(settings: Settings) -> None:
@@ -88,7 +131,7 @@ def check(settings: Settings) -> None:
             hint=f"train it on its own: {how_to_train(missing[0], settings)}",
         )
     if settings.radio.law == "scheduled":
-        linked = [name for name in settings.methods if name not in (*missing, *LINKLESS)]
+        linked = [name for name in measured(settings).methods if METHODS[name].needs_link]
         if not linked:
             raise UsageError(
                 f"law scheduled has nothing to schedule for {', '.join(settings.methods)}",
@@ -99,47 +142,18 @@ def check(settings: Settings) -> None:
     check_horizon(settings.protocol.horizon, collected.clean_steps)
     check_gaps(settings.protocol)
     parse_snr(settings.radio.snr_db)
+    check_cell(settings.radio)
 
 
 def left_out(settings: Settings) -> list[str]:
-    """The methods of the settings that no model drives which is trained here."""
+    """Return the methods of the settings that no model drives which is trained here."""
     served = servable(settings)
     return [name for name in settings.methods if name not in served]
 
 
 def servable(settings: Settings) -> tuple[str, ...]:
-    """The methods that the hierarchy of these settings can drive, and those without a model."""
+    """Return the methods that the settings' hierarchy can drive, and those without a model."""
     strides = settings.hierarchy
     kind = "flat" if strides.h == strides.m == strides.l else "hierarchy"
-    states = len(plant(settings.plant).state_names)
-    return (*offered({"kind": kind, "h": strides.h}, states), *TRUE_STATE)
-
-
-def stages(settings: Settings, screen: Screen, folder: Path) -> dict[str, Callable[[], Result]]:
-    """The five stages, each bound to what it reads and writes in ``folder``."""
-    data, model = folder / "data", str(folder / "train-hierarchy")
-    driven = tuple(name for name in settings.methods if name not in left_out(settings))
-    measured = dataclasses.replace(settings, methods=driven)
-
-    def trained_hierarchy() -> Result:
-        return train_hierarchy.run(
-            settings,
-            screen,
-            dataset=data,
-            encoder=str(folder / "train-encoder" / MODEL_FILE),
-            out=folder / "train-hierarchy",
-        )
-
-    return {
-        "collect": lambda: collect.run(settings, screen, out=data),
-        "train-encoder": lambda: train_encoder.run(
-            settings, screen, dataset=data, out=folder / "train-encoder"
-        ),
-        "train-hierarchy": trained_hierarchy,
-        "eval": lambda: evaluate.run(
-            measured, screen, checkpoint=model, dataset=data, out=folder / "eval"
-        ),
-        "scale": lambda: scale.run(
-            measured, screen, checkpoint=model, dataset=data, out=folder / "scale"
-        ),
-    }
+    offered = offered_methods({"kind": kind, "h": strides.h}, plant(settings.plant))
+    return (*offered, *without_model())

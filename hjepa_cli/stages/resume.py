@@ -11,28 +11,27 @@ from typing import Any
 from hjepa_cli import __version__
 from hjepa_cli.compute import torchrun
 from hjepa_cli.config.checks import check_settings
-from hjepa_cli.config.settings import Settings
-from hjepa_cli.core.datasets.dataset import MANIFEST, load_dataset
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.datasets.dataset import MANIFEST
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import plan
+from hjepa_cli.plugins import STAGES
+from hjepa_cli.stages.collect import describe_finished, recorded_settings
+from hjepa_cli.stages.plan import Plan
+from hjepa_cli.stages.stage import Stage
 from hjepa_cli.storage.runs import (
     CONFIG,
     RESULT,
+    check_plugins,
     load_recorded,
     read_environment,
     version_of,
 )
-from hjepa_cli.storage.shards import LOG, remove_log
-
-STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale", "reproduce")
+from hjepa_cli.storage.shards import LOG
 
 
 def run(directory: Path, screen: Screen) -> dict[str, Any]:
-    """Continue the run in ``directory``, or tell the result of a finished one.
-
-    Returns:
-        The document of ``--json`` of the run's stage.
+    """Continue the run in ``directory``, or tell a finished one's result: its stage's document.
 
     Raises:
         MissingInputError: no such run, or an input of it is gone.
@@ -40,111 +39,41 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
         As the stage.
     """
     if (directory / MANIFEST).exists():
-        from hjepa_cli.stages import collect
-
         torchrun.refuse()
-        remove_log(directory)  # a kill between the two has left it behind
-        screen.say(f"{directory} holds a finished dataset")
-        return collect.describe(load_dataset(directory), 0.0, None)
+        return describe_finished(directory, screen)
     stage, settings, inputs = recall(directory, screen)
-    if stage != "train-encoder":
+    if not stage.shared:
         torchrun.refuse()
-    dataset = _path(inputs, "dataset")
-    if stage == "collect":
-        from hjepa_cli.stages import collect
-
-        return collect.run(settings, screen, out=directory)
-    if stage == "train-encoder":
-        from hjepa_cli.stages import train_encoder
-
-        return train_encoder.run(settings, screen, dataset=dataset, out=directory)
-    if stage == "train-hierarchy":
-        from hjepa_cli.stages import train_hierarchy
-
-        encoder = _text(_path(inputs, "encoder"))
-        return train_hierarchy.run(
-            settings, screen, dataset=dataset, encoder=encoder, out=directory
-        )
-    checkpoint, remeasure = _text(_path(inputs, "checkpoint")), bool(inputs.get("remeasure"))
-    if stage == "train-reflex":
-        from hjepa_cli.stages import train_reflex
-
-        return train_reflex.run(
-            settings, screen, dataset=dataset, checkpoint=checkpoint, out=directory
-        )
-    if stage == "eval":
-        from hjepa_cli.stages import evaluate
-
-        return evaluate.run(
-            settings,
-            screen,
-            checkpoint=checkpoint,
-            dataset=dataset,
-            out=directory,
-            remeasure=remeasure,
-            further=_further(inputs),
-            figure=bool(inputs.get("figure")),
-        )
-    if stage == "scale":
-        from hjepa_cli.stages import scale
-
-        return scale.run(
-            settings,
-            screen,
-            checkpoint=checkpoint,
-            dataset=dataset,
-            out=directory,
-            remeasure=remeasure,
-            verify=bool(inputs.get("verify")),
-            further=_further(inputs),
-        )
-    from hjepa_cli.stages import reproduce
-
-    return reproduce.run(settings, screen, out=directory)
+    return stage.run(settings, screen, out=directory, **given_to(stage, inputs))
 
 
-def planned(directory: Path) -> plan.Plan:
-    """Plan of ``hjepa resume``: of the command that it repeats, which skips what is there already.
-
-    Raises:
-        MissingInputError: no such run, or an input of it is gone.
-        DataError: its records are damaged.
-    """
+def plan(directory: Path) -> Plan:
+    """Plan the command that is repeated, which skips what is there already; raises as it."""
     if any((directory / name).exists() for name in (MANIFEST, RESULT)):
-        return plan.Plan(f"resume {directory}", [f"{directory}, which is finished"], [], [], 0, 0.0)
+        return Plan(f"resume {directory}", [f"{directory}, which is finished"], [], [], 0, 0.0)
     stage, settings, inputs = recall(directory, Screen(quiet=True))
-    dataset = _path(inputs, "dataset")
-    checkpoint, encoder = _text(_path(inputs, "checkpoint")), _text(_path(inputs, "encoder"))
-    remeasure, verify, figure = (
-        bool(inputs.get(flag)) for flag in ("remeasure", "verify", "figure")
-    )
-    if stage == "collect":
-        whole = plan.plan_collect(settings, directory)
-    elif stage == "train-encoder":
-        whole = plan.plan_train_encoder(settings, dataset, directory)
-    elif stage == "train-hierarchy":
-        whole = plan.plan_train_hierarchy(settings, dataset, encoder, directory)
-    elif stage == "train-reflex":
-        whole = plan.plan_train_reflex(settings, dataset, checkpoint, directory)
-    elif stage == "eval":
-        whole = plan.plan_eval(
-            settings, checkpoint, dataset, directory, remeasure=remeasure, figure=figure
-        )
-    elif stage == "scale":
-        from hjepa_cli.core.radio.capacity import parse_snr
-
-        grid_db = parse_snr(settings.radio.snr_db)
-        whole = plan.plan_scale(
-            settings, checkpoint, dataset, directory, grid_db, remeasure=remeasure, verify=verify
-        )
-    else:
-        whole = plan.plan_reproduce(settings, directory)
+    whole = stage.plan(settings, out=directory, **given_to(stage, inputs))
     work = ["go on where it was interrupted; from the start it would", *whole.work]
     return dataclasses.replace(whole, command=f"resume {directory}", work=work)
 
 
-def recall(directory: Path, screen: Screen) -> tuple[str, Settings, dict[str, Any]]:
-    """The stage, the settings and the inputs of an unfinished run.
+def given_to(stage: Stage, inputs: dict[str, Any]) -> dict[str, Any]:
+    """Return the inputs that a run recorded as the keyword arguments that its stage takes.
+
+    What it recorded of a file is where that was; of a flag, the flag.
+    """
+    given: dict[str, Any] = {"further": []}
+    for name, value in inputs.items():
+        if isinstance(value, bool):
+            given[name] = value
+        elif isinstance(value, dict) and isinstance(value.get("path"), str):
+            given[name] = path = Path(value["path"])
+            given["further"] += [path] * name.startswith("checkpoint ")
+    return {name: given[name] for name in stage.inputs if name in given}
+
+
+def recall(directory: Path, screen: Screen) -> tuple[Stage, Settings, dict[str, Any]]:
+    """Return the stage, the settings and the recorded inputs of an unfinished run.
 
     Raises:
         MissingInputError: no such run.
@@ -154,22 +83,25 @@ def recall(directory: Path, screen: Screen) -> tuple[str, Settings, dict[str, An
     if not directory.is_dir():
         raise MissingInputError(f"run {directory} does not exist", hint="ls runs/*")
     if (directory / LOG).exists():
-        from hjepa_cli.stages.collect import recorded_settings
-
-        return "collect", recorded_settings(directory), {}
+        return STAGES["collect"], recorded_settings(directory), {}
     found = read_environment(directory)
     if found["stage"] not in STAGES:
         raise DataError(
             f"{directory} holds a run of '{found['stage']}', which this hjepa does not know"
         )
     if not (directory / CONFIG).exists():
+        words = found.get("command")
+        kept = isinstance(words, list) and all(isinstance(word, str) for word in words)
         raise MissingInputError(
             f"{directory} was stopped before its settings were kept: there is nothing to continue",
-            hint=_begun_by(found),
+            hint=shlex.join(["hjepa", *words[1:]]) if kept else None,
         )
-    made_by = version_of(found) or __version__
+    check_plugins(directory, found)
+    preset, made_by = found.get("preset"), version_of(found) or __version__
+    if preset is not None and not isinstance(preset, str):
+        raise DataError(f"{directory} is of preset {preset!r}")
     try:
-        settings = load_recorded(_preset(found, directory), directory)
+        settings = load_recorded(preset, directory)
         check_settings(settings)
     except UsageError as error:
         if made_by == __version__:
@@ -180,36 +112,4 @@ def recall(directory: Path, screen: Screen) -> tuple[str, Settings, dict[str, An
         ) from None
     if made_by != __version__:
         screen.say(f"begun by hjepa {made_by}, this is {__version__}: results may differ")
-    return found["stage"], settings, found["inputs"]
-
-
-def _preset(recorded: dict[str, Any], directory: Path) -> str | None:
-    preset = recorded.get("preset")
-    if preset is not None and not isinstance(preset, str):
-        raise DataError(f"{directory} is of preset {preset!r}")
-    return preset
-
-
-def _begun_by(found: dict[str, Any]) -> str | None:
-    """The command that began the run, as far as it was kept."""
-    command = found.get("command")
-    if not isinstance(command, list) or not all(isinstance(word, str) for word in command):
-        return None
-    return shlex.join(["hjepa", *command[1:]])
-
-
-def _path(inputs: dict[str, Any], name: str) -> Path | None:
-    """Where an input was; ``None`` if the run had none or is too old to say."""
-    described = inputs.get(name)
-    path = described.get("path") if isinstance(described, dict) else None
-    return Path(path) if isinstance(path, str) else None
-
-
-def _further(inputs: dict[str, Any]) -> list[Path]:
-    """Where the models after the first one were."""
-    paths = [_path(inputs, name) for name in inputs if name.startswith("checkpoint ")]
-    return [path for path in paths if path is not None]
-
-
-def _text(path: Path | None) -> str | None:
-    return None if path is None else str(path)
+    return STAGES[found["stage"]], settings, found["inputs"]

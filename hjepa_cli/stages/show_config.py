@@ -1,10 +1,9 @@
 """``hjepa config show``: every value that a command would use, and where it comes from."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from hjepa_cli.config.settings import Settings, dotted, origins
+from hjepa_cli.config.schema import Settings, dotted
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.storage.runs import to_toml
@@ -16,24 +15,19 @@ def show(
     screen: Screen,
     settings: Settings,
     *,
-    config: Path | None,
-    flags: Mapping[str, Any],
+    sources: Mapping[str, str],
     key: str = "",
     as_toml: bool = False,
 ) -> Result:
-    """Print the settings with their origins; returns the document of ``--json``.
+    """Print the settings with their origins; return the document of ``--json``.
 
     Args:
-        screen: where to.
+        screen: shows them.
         settings: the resolved settings.
-        config, flags: what they were resolved from, besides their preset.
-        key: only this section or value.
+        sources: where each comes from, of :func:`hjepa_cli.config.settings.origins`.
+        key: only this section or value; raise UsageError where there is none.
         as_toml: print a TOML file instead of a table, a complete one without ``key``.
-
-    Raises:
-        UsageError: no such section or value.
     """
-    sources = origins(settings.preset, config, flags)
     values = dotted(settings.as_dict())
     named = [name for name in sources if not key or name == key or name.startswith(f"{key}.")]
     shown = [name for name in named if name in values]  # empty lists say nothing
@@ -41,7 +35,12 @@ def show(
         sections = sorted({name.split(".")[0] for name in sources})
         raise UsageError(f"no setting or section '{key}'; choose from {', '.join(sections)}")
     if as_toml:
-        for line in to_toml(_only(key, settings.as_dict())).splitlines():
+        chosen = settings.as_dict()
+        if key:  # this section or value alone, and the preset that all are of
+            section, _, name = key.partition(".")
+            inside = chosen[section]
+            chosen = {"preset": settings.preset, section: {name: inside[name]} if name else inside}
+        for line in to_toml(chosen).splitlines():
             screen.result(line)
     else:
         screen.table(
@@ -55,17 +54,8 @@ def show(
     }
 
 
-def _only(key: str, values: Mapping[str, Any]) -> Result:
-    """The settings with this section or value alone, and the preset that all are of."""
-    if not key:
-        return dict(values)
-    section, _, name = key.partition(".")
-    inside = values[section]
-    return {"preset": values["preset"], section: {name: inside[name]} if name else inside}
-
-
 def text(value: Any) -> str:
-    """One value as TOML writes it, without quotes."""
+    """Return a value as TOML writes it, without quotes."""
     if isinstance(value, list):
         return f"[{', '.join(map(text, value))}]"
     return str(value).lower() if isinstance(value, bool) else str(value)

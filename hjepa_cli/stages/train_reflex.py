@@ -5,7 +5,6 @@ turn the last packet and its age into a force: the actor's force that fades, tha
 fading, and two networks that learned the teacher's plan.
 """
 
-import dataclasses
 import functools
 from pathlib import Path
 from typing import Any
@@ -15,43 +14,51 @@ import torch
 from numpy.random import Generator
 from torch import Tensor, nn
 
-from hjepa_cli.compute.device import autocast, resolve_device
+from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.settings import Settings
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.control.codecs import build_codec
-from hjepa_cli.core.control.force_error import window_means
-from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.control.drivers import coder_of, methods_of
 from hjepa_cli.core.control.sensors import embedding_sensor
-from hjepa_cli.core.datasets.dataset import Dataset
-from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks import health
-from hjepa_cli.core.networks.model import Model, build_modules, load_modules, tensors_of
+from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.networks.reflex import Reflex
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.training import decay_fit, reflex_training
 from hjepa_cli.core.training.decay_fit import Law, Trial
-from hjepa_cli.core.training.optimiser import Optimiser, fit_actor, name_samples
+from hjepa_cli.core.training.optimiser import Optimiser, name_samples
+from hjepa_cli.core.training.reflex_training import Plans
+from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.inputs import (
-    RenderedSplit,
-    embed,
-    open_dataset,
-    render,
-    training_run,
-    versions,
+from hjepa_cli.output.tables import show_reflex
+from hjepa_cli.stages import train_hierarchy
+from hjepa_cli.stages.embedding_training import (
+    begin,
+    embed_all,
+    fit_actor_to,
+    fit_network,
+    nmae_windows,
+    plan_embedding,
+    save,
+    views_of,
 )
+from hjepa_cli.stages.inputs import count_frames, embed, open_dataset
 from hjepa_cli.stages.model_set import default_model
-from hjepa_cli.stages.progress import Progress
-from hjepa_cli.stages.train_hierarchy import embed_all, views_of
-from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint, load_checkpoint, save_checkpoint
-from hjepa_cli.storage.runs import Run, describe_input
+from hjepa_cli.stages.plan import Plan, found
+from hjepa_cli.stages.training import (
+    SPLITS,
+    Drawn,
+    TrainingRun,
+    open_training_data,
+    plan_training,
+    run_training,
+)
+from hjepa_cli.storage.checkpoints import Checkpoint, load_checkpoint
 from hjepa_cli.storage.zoo import resolve_model
 
 STREAM = 5  # this stage's branch of the seed tree
-REPORT_EVERY = 50  # steps between rows of metrics.csv
 NETWORKS = ("chunk", "chunk_forces")  # in the order in which they are trained
 
 
@@ -60,10 +67,10 @@ def run(
     screen: Screen,
     *,
     dataset: Path | None = None,
-    checkpoint: str | None = None,
+    checkpoint: str | Path | None = None,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Train reflexes beside a frozen encoder and actor; returns the document of ``--json``.
+    """Train reflexes beside a frozen encoder and actor; return the document of ``--json``.
 
     Raises:
         UsageError: no such device.
@@ -71,57 +78,104 @@ def run(
         DataError: model and dataset belong to different plants, or the model has no actor.
         NumericalError: training diverged.
     """
-    resolve_device(settings.device)  # refused before anything is read
-    data = open_dataset(dataset, settings)
-    recorded = {split: data.split(split) for split in ("train", "test")}
+    data = open_training_data(dataset, settings)
     source = open_model(checkpoint, settings, screen)
-    inputs = {
-        "dataset": describe_input(data.path, data.digest),
-        "checkpoint": describe_input(source.path, source.digest),
-    }
-    with training_run("train-reflex", out, settings, inputs, screen) as (record, progress):
-        if record.result is not None:
-            show(record.result, screen)
-            return record.result
-        trained = load_modules(source)
-        torch.manual_seed(settings.seed)
-        screen.say(f"dataset {data.path}, model {source.path}, run {record.directory}")
-        architecture = describe_architecture(source, settings)
-        modules = begin(architecture, trained, settings)
-
-        train, test = (render(of, settings, screen, split) for split, of in recorded.items())
-        flip = architecture["mirror"] == "augment"
-        seen = embed_all(modules["encoder"], train, settings, screen, flip=flip)
-        z = torch.cat([embedded.z.flatten(0, 1) for embedded, _ in seen])
-        train_networks(modules, z, train, settings, record, progress, screen, flip=flip)
-
-        reflex, metadata = fit_decays(modules, z, train, source, data, settings, screen, flip=flip)
-        metadata["health"] = source.metadata["health"] | examine(modules, test, reflex, settings)
-        path = record.path(MODEL_FILE)
-        digest = save_checkpoint(path, tensors_of(modules), metadata)
-        model = Model(modules, metadata, digest, settings.device)
-        result = {
-            "checkpoint": str(path),
-            "reflex": reflex,
-            "seconds": round(progress.seconds, 2),
-            "health": metadata["health"],
-            "nmae_windows": nmae_windows(model, data, settings),
-            "n_rollouts": len(data.split("clean")),
-        }
-        result = record.finish(result)
-        progress.remove()
-        show(result, screen)
-        named = ",".join(model.methods)
-        screen.say(f"model {path} in {result['seconds']:.0f} s; next: hjepa eval --methods {named}")
-        return result
+    train, name = functools.partial(train_on, source), "train-reflex"
+    return run_training(
+        name, out, data, settings, screen, train=train, show=show_reflex, checkpoint=source
+    )
 
 
-def open_model(name: str | None, settings: Settings, screen: Screen) -> Checkpoint:
-    """The model to build on: what ``--checkpoint`` names, or the newest run's, or the zoo's.
+def plan(
+    settings: Settings,
+    *,
+    dataset: Path | None = None,
+    checkpoint: str | Path | None = None,
+    out: Path | None = None,
+) -> Plan:
+    """Plan the networks' loops and the searches on the embeddings of all views of the dataset."""
+    options, protocol = settings.reflex, settings.protocol
+    data, dataset_line = found(
+        "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
+    )
+    find = functools.partial(open_model, checkpoint, settings, Screen(quiet=True))
+    _, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
+    embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))
+    plans = len(NETWORKS) * len(views_of(settings, 0, flip=settings.encoder.mirror == "augment"))
+    plans *= count_frames(data, settings, "train")
+    samples = len(NETWORKS) * options.steps * options.batch_packets * options.batch_ages
+    # Two laws and two decays are searched, each at a few gaps around the one that is looked for.
+    steps = 2 * len(decay_fit.AROUND) * (protocol.warmup_steps + options.search_steps)
+    laws = options.search_candidates * options.search_rounds * options.search_devices
+    decays = options.fit_candidates * options.fit_rounds * options.fit_devices
+    return plan_training(
+        "train-reflex",
+        settings,
+        out,
+        describe_architecture(settings),
+        reads=[dataset_line, model_line],
+        work=[
+            embedding,
+            f"train {len(NETWORKS)} networks for {options.steps} steps of "
+            f"{options.batch_packets} packets at {options.batch_ages} ages",
+            "search a law whose force fades, and fit two decays on embeddings",
+        ],
+        amounts={
+            **amounts,
+            "reflex training samples": samples,
+            "device-steps of searches": laws * steps + plans * protocol.gaps[-1],
+            "device-steps on states": decays * steps,
+            "closed-loop frames": 4 * decays * steps / protocol.gaps[-1],  # two packets a gap
+        },
+    )
 
-    Raises:
-        MissingInputError: none there.
-        DataError: of another plant, or without an actor on embeddings.
+
+def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
+    """Train beside a checkpoint's encoder and actor, examine and save; return the result."""
+    settings, screen, data = run.settings, run.screen, run.dataset
+    trained = load_modules(source)
+    screen.say(f"dataset {data.path}, model {source.path}, run {run.record.directory}")
+    architecture = describe_architecture(settings, source.metadata["architecture"])
+    modules = begin(architecture, trained, settings, taken=("encoder", "actor"))
+    modules["actor"].requires_grad_(False).eval()
+
+    train, test = run.render()
+    flip = architecture["mirror"] == "augment"
+    seen = embed_all(modules["encoder"], train, settings, screen, flip=flip)
+    z = torch.cat([embedded.z.flatten(0, 1) for embedded, _ in seen])
+    starts, sides = states_behind(train, settings, flip=flip)
+    train_networks(run, modules, z, starts, sides)
+
+    law, trial, reflex = search_laws(settings, screen)
+    labels = labels_of_law(plant(settings.plant), law, starts, sides)
+    fit_actor_to(modules, "law", z, labels, architecture, settings)
+    metadata = run.metadata(
+        architecture, encoder=source.digest, health=source.metadata["health"], reflex=reflex
+    )
+    screen.say("fitting both decays on embeddings")
+    fit_decays(Model(modules, metadata, "", settings.device), trial, reflex, settings)
+    metadata["health"] = metadata["health"] | examine(modules, test, law, settings)
+    model = save(run, modules, metadata)
+    methods = methods_of(model)
+    result = run.finish(
+        reflex=reflex,
+        health=metadata["health"],
+        nmae_windows={name: nmae_windows(model, name, data, settings) for name in methods},
+        n_rollouts=len(data.split("clean")),
+    )
+    show_reflex(result, screen)
+    screen.say(
+        f"model {result['checkpoint']} in {result['seconds']:.0f} s; "
+        f"next: hjepa eval --methods {','.join(methods)}"
+    )
+    return result
+
+
+def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> Checkpoint:
+    """Open the model to build on: the named one, or the newest run's, or the zoo's.
+
+    Raises MissingInputError without one, DataError for another plant's or one without an actor on
+    embeddings.
     """
     path = resolve_model(name) if name else default_model(settings, screen)
     if path is None:
@@ -146,47 +200,31 @@ def open_model(name: str | None, settings: Settings, screen: Screen) -> Checkpoi
     return checkpoint
 
 
-def describe_architecture(source: Checkpoint, settings: Settings) -> dict[str, Any]:
-    """The model's architecture with this stage's networks."""
-    return source.metadata["architecture"] | {
+def describe_architecture(
+    settings: Settings, begun: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the architecture ``begun`` by a checkpoint with this stage's networks.
+
+    Without one it is that of the hierarchy that the settings train.
+    """
+    return (begun or train_hierarchy.describe_architecture(settings)) | {
         "kind": "reflex",
         "longest_age": settings.protocol.gaps[-1],
         "forces_at_once": settings.reflex.forces_at_once,
     }
 
 
-def begin(
-    architecture: dict[str, Any], trained: nn.ModuleDict, settings: Settings
-) -> nn.ModuleDict:
-    """New networks, but for the frozen encoder and actor."""
-    kind = plant(settings.plant)
-    modules = build_modules(architecture, kind.action_shape, kind.force_signs)
-    for name in ("encoder", "actor"):
-        modules[name].load_state_dict(trained[name].state_dict())
-        modules[name].requires_grad_(False).eval()
-    return modules.to(resolve_device(settings.device))
-
-
 def train_networks(
-    modules: nn.ModuleDict,
-    z: Tensor,
-    train: RenderedSplit,
-    settings: Settings,
-    record: Run,
-    progress: Progress,
-    screen: Screen,
-    *,
-    flip: bool,
+    run: TrainingRun, modules: nn.ModuleDict, z: Tensor, starts: Floats, sides: Floats
 ) -> None:
     """Train both networks on what the teacher does after each embedding z [N, D]."""
-    options, device = settings.reflex, resolve_device(settings.device)
-    starts, sides = states_behind(train, settings, flip=flip)
-    for number, name in enumerate(NETWORKS):
+    settings, options = run.settings, run.settings.reflex
+    for number, name in enumerate(NETWORKS, start=1):
         network = modules[name]
         assert isinstance(network, Reflex)
-        stream = generator(settings.seed, STREAM, 1 + number)
+        stream = generator(settings.seed, STREAM, number)
         explore = stream if network.sees_forces else None
-        screen.say(f"{name}: {len(starts)} plans of the teacher")
+        run.screen.say(f"{name}: {len(starts)} plans of the teacher")
         plans = teacher_plans(network, starts, sides, settings, explore)
         optimiser = Optimiser(
             network.parameters(),
@@ -197,26 +235,20 @@ def train_networks(
             weight_decay=options.weight_decay,
             gradient_clip=options.gradient_clip,
         )
-        network.train()
-        parts = {"modules": modules, "optimiser": optimiser}
-        done = progress.reached(name)
-        with screen.progress(f"train {name}", options.steps, "steps", done=done) as bar:
-            for step in progress.steps(name, options.steps, parts, stream):
-                drawn = reflex_training.draw(
-                    network, len(starts), options.batch_packets, options.batch_ages, stream
-                )
-                with autocast(device, settings.encoder.precision):
-                    loss = reflex_training.reflex_loss(network, z, plans, drawn)
-                batch = functools.partial(name_samples, "embeddings", drawn.packets)
-                value = optimiser.step(loss, step, batch)
-                bar.advance(1, loss=value)
-                if (step + 1) % REPORT_EVERY == 0 or step + 1 == options.steps:
-                    record.metric({"level": name, "step": step + 1, "loss": value})
-        network.eval()
+
+        def draw(
+            network: Reflex = network, plans: Plans = plans, stream: Generator = stream
+        ) -> Drawn:
+            count, ages = options.batch_packets, options.batch_ages
+            rows, drawn_ages = reflex_training.draw(network, len(z), count, ages, stream)
+            loss = reflex_training.reflex_loss(network, z, plans, rows, drawn_ages)
+            return loss, functools.partial(name_samples, "embeddings", rows)
+
+        fit_network(run, modules, name, optimiser, stream, draw)
 
 
 def states_behind(train: RenderedSplit, settings: Settings, *, flip: bool) -> tuple[Floats, Floats]:
-    """The states [N, S] that all embeddings show, and what their forces are multiplied by [N, F].
+    """Return the states [N, S] that all embeddings show, and the factors [N, F] of their forces.
 
     A mirrored picture has the forces of its unmirrored state, mirrored.
     """
@@ -233,118 +265,64 @@ def states_behind(train: RenderedSplit, settings: Settings, *, flip: bool) -> tu
 
 def teacher_plans(
     network: Reflex, starts: Floats, sides: Floats, settings: Settings, explore: Generator | None
-) -> reflex_training.Plans:
-    """What the teacher does from each state on, for a network's longest age and one call more."""
+) -> Plans:
+    """Return what the teacher does from each state on, for a network's longest age and a call."""
     kind, steps = plant(settings.plant), network.longest_age + network.shape[0]
-    pushes_n = None
+    options, pushes_n = settings.collect, None
     if explore is not None:
         pushes_n = reflex_training.pushes(
-            kind,
-            len(starts),
-            steps,
-            exploration_n=settings.collect.exploration_n,
-            hold_steps=settings.collect.exploration_hold_steps,
+            *(kind, len(starts), steps),
+            exploration_n=options.exploration_n,
+            hold_steps=options.exploration_hold_steps,
             generator=explore,
         )
     return reflex_training.follow(kind, starts, steps, sides=sides, pushes_n=pushes_n)
 
 
-def fit_decays(
-    modules: nn.ModuleDict,
-    z: Tensor,
-    train: RenderedSplit,
-    source: Checkpoint,
-    data: Dataset,
-    settings: Settings,
-    screen: Screen,
-    *,
-    flip: bool,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Search the law and both decays; ``modules["law"]`` learns the law.
+def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[str, Any]]:
+    """Search laws whose force fades, on the true state.
 
     Returns:
-        What the checkpoint says of them, and all of its metadata but its health.
+        The best law, the trial of the search, and what the checkpoint says of it: the law, how
+        the teacher's own force would fade, and what decays are to be fitted to.
     """
-    options, kind = settings.reflex, plant(settings.plant)
+    options, protocol, seed = settings.reflex, settings.protocol, settings.seed
     searched = {"candidates": options.search_candidates, "rounds": options.search_rounds}
     screen.say("searching laws whose force fades, on the true state")
-    wide = Trial.make(
-        kind,
-        settings.protocol,
-        devices=options.search_devices,
-        steps=options.search_steps,
-        seed=settings.seed,
-    )
-    law, _ = decay_fit.search_law(wide, seed=settings.seed, **searched)
-    faded, gain = decay_fit.search_law(wide, seed=settings.seed, tied=True, **searched)
-    starts, sides = states_behind(train, settings, flip=flip)
-    architecture = describe_architecture(source, settings)
-    fit_law(modules, z, labels_of_law(kind, law, starts, sides), architecture, settings)
-    reflex: dict[str, Any] = {
+    kind, devices = plant(settings.plant), options.search_devices
+    trial = Trial.make(kind, protocol, devices=devices, steps=options.search_steps, seed=seed)
+    law, _ = decay_fit.search_law(trial, seed=seed, **searched)
+    faded, gain = decay_fit.search_law(trial, seed=seed, tied=True, **searched)
+    said = {
         "gain": gain,
         "tau_steps": faded.tau_steps,
         "law": {"gains_n": law.gains_n.tolist(), "tau_steps": law.tau_steps, "gain": 1.0},
         "fitted": {
-            "gaps": wide.gaps.tolist(),
+            "gaps": trial.gaps.tolist(),
             "devices": options.fit_devices,
-            "warmup_steps": settings.protocol.warmup_steps,
+            "warmup_steps": protocol.warmup_steps,
             "steps": options.search_steps,
-            "seed": settings.seed + decay_fit.SEARCH_SEED,
+            "seed": seed + decay_fit.SEARCH_SEED,
         },
     }
-    metadata = {
-        "stage": "train-reflex",
-        "plant": settings.plant,
-        "architecture": architecture,
-        "settings": settings.as_dict(),
-        "dataset": data.digest,
-        "encoder": source.digest,
-        "camera": data.camera,
-        "seed": settings.seed,
-        "versions": versions(),
-        "health": source.metadata["health"],
-        "reflex": reflex,
-    }
-    screen.say("fitting both decays on embeddings")
-    model = Model(modules, metadata, "", settings.device)
-    sensor = embedding_sensor(model, build_codec(settings.protocol.payload, model, settings))
-    few = wide.first(options.fit_devices)
+    return law, trial, said
+
+
+def fit_decays(model: Model, trial: Trial, reflex: dict[str, Any], settings: Settings) -> None:
+    """Fit gain and time of both decays in ``reflex``, the actor's and the law's, to embeddings."""
+    options = settings.reflex
+    sensor = embedding_sensor(model, coder_of(settings, model).send)
+    few = trial.first(options.fit_devices)
+    searched = {"candidates": options.fit_candidates, "rounds": options.fit_rounds}
     for part, actor in ((reflex, model.actor), (reflex["law"], model.law)):
+        start = (part["gain"], part["tau_steps"])
         part["gain"], part["tau_steps"] = decay_fit.fit_decay(
-            few,
-            actor,
-            sensor,
-            (part["gain"], part["tau_steps"]),
-            candidates=options.fit_candidates,
-            rounds=options.fit_rounds,
-            seed=settings.seed,
+            few, actor, sensor, start, seed=settings.seed, **searched
         )
-    return reflex, metadata
-
-
-def fit_law(
-    modules: nn.ModuleDict,
-    z: Tensor,
-    labels: Tensor,
-    architecture: dict[str, Any],
-    settings: Settings,
-) -> None:
-    """Fit the actor of a law to all embeddings, as the semantic actor is fitted to the teacher."""
-    hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
-    exact = architecture["mirror"] == "exact"
-    fitted = fit_actor(
-        z,
-        labels,
-        dataclasses.replace(settings.actor, hidden=hidden, dropout=dropout),
-        seed=settings.seed,
-        mirror=plant(settings.plant).force_signs if exact else None,
-    )
-    modules["law"].load_state_dict(fitted.state_dict())
-    modules["law"].eval()
 
 
 def labels_of_law(kind: System, law: Law, states: Floats, sides: Floats) -> Tensor:
-    """Forces ÷ force limit [N, *A] of a law in states [N, S], clipped, mirrored by [N, F]."""
+    """Return a law's forces ÷ force limit [N, *A] in states [N, S], clipped, times sides [N, F]."""
     forces_n = -states @ law.gains_n.T
     share = np.clip(forces_n / kind.force_limit_n, -1.0, 1.0) * sides
     return torch.from_numpy(share.reshape(len(states), *kind.action_shape).astype(np.float32))
@@ -352,52 +330,11 @@ def labels_of_law(kind: System, law: Law, states: Floats, sides: Floats) -> Tens
 
 @torch.inference_mode()
 def examine(
-    modules: nn.ModuleDict, test: RenderedSplit, reflex: dict[str, Any], settings: Settings
+    modules: nn.ModuleDict, test: RenderedSplit, law: Law, settings: Settings
 ) -> dict[str, float]:
-    """Held-out health of the actor of the law."""
-    kind = plant(settings.plant)
+    """Return the held-out health of the actor of a law."""
     z = embed(modules["encoder"], test, settings).flatten(0, 1)
-    law = Law(np.array(reflex["law"]["gains_n"]), reflex["law"]["tau_steps"])
     states = test.states.numpy().astype(float).reshape(len(z), -1)
-    truth = labels_of_law(kind, law, states, np.ones((len(z), law.gains_n.shape[0])))
+    truth = labels_of_law(plant(settings.plant), law, states, np.ones((1, len(law.gains_n))))
     device = resolve_device(settings.device)
     return {"law_nrmse": health.nrmse(modules["law"].act(z.to(device)).cpu(), truth)}  # type: ignore[operator]
-
-
-def nmae_windows(model: Model, data: Dataset, settings: Settings) -> dict[str, dict[str, float]]:
-    """How far each method's forces are from the teacher's after one packet, on clean rollouts."""
-    clean = data.split("clean")
-    steps = min(settings.protocol.horizon, clean.steps - 1)
-    found = {}
-    for name in model.methods:
-        errors = control_errors(
-            build_method(name, settings, model),
-            clean.states.astype(float),
-            clean.teacher_n.astype(float),
-            model.force_limit_n,
-            steps,
-        )
-        windows = window_means(errors)
-        found[name] = {window: float(error.mean()) for window, error in windows.items()}
-    return found
-
-
-def show(result: dict[str, Any], screen: Screen) -> None:
-    """What each method does after one packet, and how the forces fade."""
-    reflex = result["reflex"]
-    decays = {"hold-decay": reflex, "hold-decay-linear": reflex["law"]}
-    windows = list(next(iter(result["nmae_windows"].values())))
-    screen.table(
-        f"after one packet: NMAE by steps ({result['n_rollouts']} clean rollouts); factor and "
-        "time of what fades",
-        ["method", *windows, "s", "τ [steps]"],
-        [
-            [
-                name,
-                *(f"{errors[window]:.3f}" for window in windows),
-                f"{decays[name]['gain']:.2f}" if name in decays else "-",
-                f"{decays[name]['tau_steps']:.1f}" if name in decays else "-",
-            ]
-            for name, errors in result["nmae_windows"].items()
-        ],
-    )

@@ -12,24 +12,25 @@ import numpy as np
 import torch
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.checks import ANCHORS, RAW_FRAMES
-from hjepa_cli.config.settings import Settings
-from hjepa_cli.core.control.codecs import bits_of
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.controllers import StrideController
+from hjepa_cli.core.control.drivers import build_driver, methods_of
 from hjepa_cli.core.control.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
-from hjepa_cli.core.control.methods import build_method
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
+from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
-from hjepa_cli.core.radio.capacity import equal_devices
 from hjepa_cli.core.radio.channel import rayleigh_power_gains
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.core.radio.laws.equal import equal_devices
+from hjepa_cli.errors import MissingInputError, UsageError, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.model_set import Subject, open_subject
+from hjepa_cli.plugins import CODECS, METHODS
+from hjepa_cli.stages.model_set import ModelSet, open_model_set
+from hjepa_cli.stages.plan import Plan, seconds_of
 from hjepa_cli.storage import files
 
 FADING_KEY = 0xFAD1
@@ -37,12 +38,7 @@ PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encod
 
 
 class Believer:
-    """A controller whose belief is read at every step.
-
-    Args:
-        controller: drives n devices from embeddings.
-        probe: of :func:`hjepa_cli.core.networks.health.fit_probe`.
-    """
+    """A controller of n devices whose belief is read, by a linear probe, at every step."""
 
     def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
         self._controller, self._probe = controller, probe
@@ -50,7 +46,7 @@ class Believer:
         self.believed: list[Floats] = []
 
     def act(self, delivered: Bools, packets: Any) -> Floats:
-        """Forces of one step [n]."""
+        """Return the forces of one step [n, *A]."""
         forces_n = self._controller.act(delivered, packets)
         if isinstance(self._controller, StrideController):
             start, end, share = self._controller.belief
@@ -84,56 +80,46 @@ def run(
     fps: int = 20,
     live: bool = False,
 ) -> dict[str, Any]:
-    """Simulate, then draw a GIF or MP4, or play in the terminal; returns the ``--json`` document.
+    """Simulate, then draw a GIF or MP4, or play in the terminal; return the ``--json`` document.
 
     Args:
         settings: plant, seed, methods, protocol and bandwidth.
-        screen: where to say so.
+        screen: shows progress, and the film if ``live``.
         checkpoint: zoo name, run directory or file; default: the newest run, else the zoo.
-        out: ``.gif`` or ``.mp4``.
-        devices: side by side.
-        snr_db: mean SNR of the fading link.
-        delivery: share of packets that arrive.
+        out: ``.gif`` or ``.mp4``, with ``fps`` pictures per second or, in a GIF, about as many.
+        devices: how many are side by side.
+        snr_db, delivery: mean SNR of the fading link, and the share of packets that arrive.
         gap_steps: instead of fading, one packet every so many steps.
         every: control steps between pictures; default: a hundred pictures in all.
-        fps: pictures per second; a GIF takes the nearest rate that it can hold.
-        live: play in the terminal instead of writing a file.
+        fps, live: as on the command line.
 
     Raises:
         UsageError: a method that the model does not hold or that sends no embedding, a format we
             do not write, more pictures per second than a GIF holds, no terminal.
         MissingInputError: no model, or a library is missing.
     """
-    try:
-        from hjepa_cli.output import animation
-        from hjepa_cli.output import live as terminal
-    except ModuleNotFoundError as missing:
-        if missing.name != "PIL":
-            raise
-        raise MissingInputError(
-            "a view needs Pillow, which is not installed", hint='pip install "hjepa[plot]"'
-        ) from None
+    require("PIL", "a view needs Pillow", "plot")
+    from hjepa_cli.output import animation
+    from hjepa_cli.output import live as terminal
+
     if not live:
         animation.check_target(out, fps)
-        files.make_directory(out.parent)
+        out = files.target(out)
     elif not screen.is_terminal:
         raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
-    subject = open_viewable(settings, screen, checkpoint)
-    link = make_link(settings, subject.model, devices, snr_db, delivery, gap_steps)
+    models = open_viewable(settings, screen, checkpoint)
+    link = make_link(settings, models.model, devices, snr_db, delivery, gap_steps)
     screen.say(link.label)
-    probe = fit_probe(settings, subject.model, screen)
-    films = [film(name, settings, subject.model, link, probe, screen) for name in settings.methods]
+    probe = fit_probe(settings, models.model, screen)
+    films = [film(name, settings, models.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.total_steps // 100, 1)
     kind = actual_plant(settings)
     pictures = animation.Pictures(films, link, kind, actual_camera(settings), every)
     result = {
-        "checkpoint": subject.path,
+        "checkpoint": models.path,
         "methods": {
-            shot.method: {
-                "share_in_band": shot.score.mean(axis=0),
-                **belief_errors(shot, kind),
-            }
-            for shot in films
+            one.method: {"share_in_band": one.score.mean(axis=0), **belief_errors(one, kind)}
+            for one in films
         },
         "delivered": link.delivered.mean(),
         "pictures": len(pictures),
@@ -149,27 +135,45 @@ def run(
     return result
 
 
-def belief_errors(shot: Film, kind: System) -> dict[str, float]:
-    """Mean distance between true and believed states: ``belief_error_x_m`` and so on."""
-    errors = np.abs(shot.believed - shot.states).mean(axis=(0, 1))
-    described = zip(kind.state_names, kind.state_units, errors.tolist(), strict=True)
-    return {
-        f"belief_error_{name}_{unit.replace('/', '_')}": error for name, unit, error in described
-    }
+def plan(
+    settings: Settings, *, checkpoint: str | None, out: Path, devices: int, live: bool
+) -> Plan:
+    """Plan a film; arguments as of :func:`run`."""
+    models = open_viewable(settings, Screen(quiet=True), checkpoint)
+    steps, methods = settings.protocol.total_steps, settings.methods
+    frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
+    return Plan(
+        command="view",
+        reads=[f"model {models.name}"],
+        work=[
+            "fit a linear probe of the state on embeddings",
+            f"drive {devices} devices for {steps} steps with {', '.join(methods)}",
+        ],
+        writes=[] if live else [f"animation {out}"],
+        writes_bytes=0 if live else 10_000 * 100 * devices * len(methods) // 4,
+        seconds=10 + seconds_of({"closed-loop frames": frames}),
+    )
 
 
-def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) -> Subject:
+def belief_errors(film: Film, kind: System) -> dict[str, float]:
+    """Return the mean distances of true and believed states, ``belief_error_x_m`` and so on."""
+    errors = np.abs(film.believed - film.states).mean(axis=(0, 1))
+    units = [unit.replace("/", "_") for unit in kind.state_units]
+    described = zip(kind.state_names, units, errors.tolist(), strict=True)
+    return {f"belief_error_{name}_{unit}": error for name, unit, error in described}
+
+
+def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) -> ModelSet:
     """Open a model whose methods believe in something that can be shown: those on embeddings.
 
-    Raises:
-        MissingInputError: no model of the plant.
-        UsageError: a method sends something else, or the model does not hold it.
+    Raise MissingInputError without a model of the plant, UsageError for any other method.
     """
-    subject = open_subject(settings, screen, checkpoint, None)
-    if subject.model is None:
+    models = open_model_set(settings, screen, checkpoint, None)
+    if models.model is None:
         train = f"hjepa reproduce --preset {settings.preset}"
         raise MissingInputError(f"no model of plant {settings.plant}", hint=train)
-    viewable = [name for name in subject.model.methods if name not in (*RAW_FRAMES, *ANCHORS)]
+    held = {name: METHODS[name] for name in methods_of(models.model)}
+    viewable = [name for name, of in held.items() if of.sends == "embedding" and not of.fitted]
     for name in settings.methods:
         if name not in viewable:
             raise UsageError(
@@ -177,7 +181,7 @@ def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) ->
                 f"choose from {', '.join(viewable)}",
                 hint=f"hjepa view --methods {viewable[0]}",
             )
-    return subject
+    return models
 
 
 def make_link(
@@ -188,7 +192,7 @@ def make_link(
     delivery: float,
     gap_steps: float | None,
 ) -> Link:
-    """Rayleigh block fading with a delivery probability, or periodic packets.
+    """Draw Rayleigh block fading with a delivery probability, or make periodic packets.
 
     A packet arrives where the gain |h|² reaches -ln p: then it does with probability p. That is
     the law ``equal`` for as many devices as bring p about.
@@ -198,16 +202,11 @@ def make_link(
         schedule = gap_schedule(gap_steps, steps, devices)
         label = f"a packet every {gap_steps:g} steps, SNR {snr_db:g} dB by power control"
         return Link(schedule, np.full((steps, devices), snr_db), False, label)
-    gains = np.stack(
-        [
-            rayleigh_power_gains(generator(settings.seed, FADING_KEY, device), steps)
-            for device in range(devices)
-        ],
-        axis=1,
-    )
+    streams = [generator(settings.seed, FADING_KEY, device) for device in range(devices)]
+    gains = np.stack([rayleigh_power_gains(stream, steps) for stream in streams], axis=1)
     delivered = gains >= -np.log(delivery)
     delivered[0] = True
-    bits = bits_of(settings.protocol.payload, model.architecture["embedding"])
+    bits = CODECS[settings.protocol.payload].bits(model.architecture["embedding"])
     sharing = equal_devices(delivery, bits, settings.radio.bandwidth_hz, kind.step_s, snr_db)
     label = (
         f"Rayleigh fading, mean SNR {snr_db:g} dB, packets arrive with p = {delivery:g}: "
@@ -217,7 +216,7 @@ def make_link(
 
 
 def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
-    """A linear probe from embeddings to states, on training trajectories made from the seed."""
+    """Fit a linear probe from embeddings to states, on trajectories made from the seed."""
     count = min(PROBE_TRAJECTORIES, settings.collect.trajectories)
     recorded = generate(settings, "train")[:count]
     camera = plant(settings.plant).camera()
@@ -226,8 +225,7 @@ def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
         for trajectory in recorded.states:
             now = np.arange(1, len(trajectory), PROBE_EVERY)
             pairs = trajectory[np.stack([now - 1, now], axis=1)]
-            frames = camera.render(pairs.reshape(-1, pairs.shape[-1]))
-            embeddings.append(model.encode(frames.reshape(-1, 2, *frames.shape[1:])))
+            embeddings.append(model.encode(frames_of(camera, pairs)))
             states.append(torch.from_numpy(trajectory[now]))
             bar.advance()
     return health.fit_probe(torch.cat(embeddings), torch.cat(states))
@@ -238,7 +236,7 @@ def film(
 ) -> Film:
     """Drive the devices with one method and keep every state and belief."""
     kind = actual_plant(settings)
-    method = build_method(name, settings, model)
+    method = build_driver(name, settings, model)
     steps, devices = link.delivered.shape
     believer = Believer(method.controller(devices), probe)
     states: list[Floats] = []

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.errors import DataError, MissingInputError, NumericalError
+from hjepa_cli.storage import seals
 from hjepa_cli.storage import tensors as arrays
 from hjepa_cli.storage.files import (
     canonical_json,
@@ -29,7 +30,7 @@ SIZE_LIMIT_BYTES = 4 * 2**30
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A verified checkpoint: float32 or int64 arrays by name, and the writer's metadata."""
+    """It is verified, and holds float32 or int64 arrays by name and the writer's metadata."""
 
     tensors: dict[str, np.ndarray]
     metadata: dict[str, Any]
@@ -40,12 +41,7 @@ class Checkpoint:
 def save_checkpoint(
     path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, Any]
 ) -> str:
-    """Write a checkpoint atomically and return its sha256.
-
-    Args:
-        path: the file to replace.
-        tensors: float32 or int64 arrays.
-        metadata: plain JSON data; ``schema`` and ``sha256`` are added here.
+    """Write float32 or int64 arrays and plain JSON data atomically, and return their sha256.
 
     Raises:
         NumericalError: a tensor or the metadata holds NaN or an infinity.
@@ -56,14 +52,13 @@ def save_checkpoint(
         raise NumericalError(f"refusing to write {path}: tensor '{name}' is not finite")
     if reserved := {"schema", "sha256"} & metadata.keys():
         raise ValueError(f"metadata may not use the reserved keys {sorted(reserved)}")
-    sealed = {**metadata, "schema": SCHEMA, "sha256": ""}
     try:
-        canonical_json(sealed)
+        canonical_json(metadata)
     except ValueError as error:
         raise NumericalError(f"refusing to write {path}: metadata: {error}") from None
-    digest = arrays.content_digest(sealed, tensors)
-    write_bytes(path, arrays.pack(tensors, canonical_json({**sealed, "sha256": digest})))
-    return digest
+    sealed = seals.sealed({**metadata, "schema": SCHEMA}, tensors)
+    write_bytes(path, arrays.pack(tensors, canonical_json(sealed)))
+    return str(sealed[seals.SEAL])
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
@@ -81,47 +76,22 @@ def load_checkpoint(path: Path) -> Checkpoint:
         ) from None
     tensors, text = arrays.unpack(data, path)
     del data  # never more than twice the file in memory
-    sealed = _metadata(text, path)
-    check_schema(sealed.get("schema"), SCHEMA, f"checkpoint {path}")
-    digest = arrays.content_digest({**sealed, "sha256": ""}, tensors)
-    if sealed.get("sha256") != digest:
-        raise DataError(
-            f"checkpoint {path} was changed after it was written: its sha256 does not match",
-            hint="train it again, or restore the original file",
-        )
-    if name := arrays.non_finite(tensors):
-        raise DataError(f"checkpoint {path}: tensor '{name}' is not finite")
-    metadata = {key: value for key, value in sealed.items() if key not in ("schema", "sha256")}
-    return Checkpoint(tensors, metadata, digest, path)
-
-
-def check_tensors(
-    checkpoint: Checkpoint, expected: Mapping[str, tuple[str, tuple[int, ...]]]
-) -> None:
-    """Demand exactly these tensors: name to (dtype name, shape), nothing missing or extra.
-
-    Raises:
-        DataError: naming the first difference.
-    """
-    found = checkpoint.tensors
-    for name in sorted(expected.keys() | found.keys()):
-        if name not in found:
-            reason = f"tensor '{name}' is missing"
-        elif name not in expected:
-            reason = f"tensor '{name}' is unexpected"
-        else:
-            is_ = (found[name].dtype.name, found[name].shape)
-            should = (expected[name][0], tuple(expected[name][1]))
-            if is_ == should:
-                continue
-            reason = f"tensor '{name}' is {is_[0]} {is_[1]}; expected {should[0]} {should[1]}"
-        raise DataError(f"checkpoint {checkpoint.path} does not fit its architecture: {reason}")
-
-
-def _metadata(text: object, path: Path) -> dict[str, Any]:
     if not isinstance(text, str):
         raise DataError(f"{path} is not an hjepa checkpoint: it has no hjepa metadata")
     try:
-        return parse_json(text)
+        metadata = parse_json(text)
     except ValueError as error:
         raise DataError(f"checkpoint {path} has damaged metadata: {error}") from None
+    check_schema(metadata.get("schema"), SCHEMA, f"checkpoint {path}")
+    again = "train it again, or restore the original file"
+    seals.check(metadata, f"checkpoint {path}", again, tensors)
+    if name := arrays.non_finite(tensors):
+        raise DataError(f"checkpoint {path}: tensor '{name}' is not finite")
+    del metadata["schema"]
+    return Checkpoint(tensors, metadata, metadata.pop(seals.SEAL), path)
+
+
+def check_tensors(checkpoint: Checkpoint, expected: arrays.Shapes) -> None:
+    """Raise DataError unless a checkpoint has exactly these tensors."""
+    if reason := arrays.difference(checkpoint.tensors, expected):
+        raise DataError(f"checkpoint {checkpoint.path} does not fit its architecture: {reason}")

@@ -8,78 +8,86 @@ helpers serve run directories and datasets.
 import contextlib
 import errno
 import fcntl
+import functools
 import io
+import itertools
 import json
-import math
 import os
 import platform
 import re
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+import stat
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from hjepa_cli.errors import (
-    DataError,
-    HjepaError,
-    LockedError,
-    MissingInputError,
-    StorageError,
-)
+import msgspec
+
+from hjepa_cli import errors
+from hjepa_cli.errors import DataError, MissingInputError, StorageError
 
 LOCK_FILE = ".lock"
 JSON_LIMIT_BYTES = 16 * 2**20
+TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp")  # .<name>.<random>.<pid>.tmp: a half-written file
 
-_TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp")  # .<name>.<random>.<pid>.tmp
 _HOLDER = re.compile(rb"process \d{1,20} on [\w.-]{1,64}")
-_NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _AGAIN = "run the same command again"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Replace ``path`` by ``data`` atomically; its mode follows the umask.
-
-    Raises:
-        StorageError: the disk refused; ``path`` is what it was before.
-    """
+    """Replace ``path`` by ``data`` atomically, with a mode by the umask; else StorageError."""
     # Workers in containers have equal pids, and two may write the same shard at the same time.
+    _refuse_special(path)
     unique = f"{secrets.token_hex(4)}.{os.getpid()}"
     temporary = path.with_name(f".{path.name}.{unique}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        _sync_directory(path.parent)
-    except OSError as error:
-        raise storage_error(path, error) from None
+        with writing(path):
+            with open(temporary, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            _sync_directory(path.parent)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
 
 
+def target(path: Path) -> Path:
+    """Return where to write a file that a person named: where links lead; its directory is made.
+
+    What a directory of ours holds is written with :func:`write_bytes` alone, which follows no link.
+
+    Raises:
+        StorageError: it is a device, a pipe, a socket or a circle of links.
+    """
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path
+    _refuse_special(path, _SPECIAL | {stat.S_IFLNK: "a circle of links"})
+    make_directory(path.parent)
+    return path
+
+
 def write_text(path: Path, text: str) -> None:
-    """Replace ``path`` by UTF-8 ``text`` atomically. Raises StorageError."""
-    write_bytes(path, text.encode("utf-8"))
+    """Replace ``path`` by UTF-8 ``text`` atomically; else StorageError."""
+    write_bytes(path, text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:
     """Replace ``path`` by readable JSON with sorted keys, atomically; NaN is a ValueError."""
-    text = json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=2)
-    write_text(path, text + "\n")
+    write_text(path, _dumps(value, indent=2) + "\n")
 
 
 def canonical_json(value: Any) -> str:
     """Return the one JSON text of ``value``: sorted keys, no spaces, no NaN (ValueError)."""
-    return json.dumps(
-        value, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":")
-    )
+    return _dumps(value, separators=(",", ":"))
+
+
+_dumps = functools.partial(json.dumps, sort_keys=True, allow_nan=False, ensure_ascii=False)
 
 
 def parse_json(text: str | bytes) -> dict[str, Any]:
-    """Parse a JSON object strictly: no NaN, no duplicate keys. Raises ValueError."""
+    """Parse a JSON object strictly: a NaN or a duplicate key is a ValueError."""
     try:
         value = json.loads(text, object_pairs_hook=_unique_keys)
         canonical_json(value).encode()  # refuses NaN, infinities and lone surrogates
@@ -91,22 +99,15 @@ def parse_json(text: str | bytes) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object of at most :data:`JSON_LIMIT_BYTES`.
-
-    Raises:
-        MissingInputError: no such file.
-        DataError: too large, or not a strict JSON object.
-        StorageError: the disk refused.
-    """
-    data = read_bytes(path, limit=JSON_LIMIT_BYTES)
+    """Read a strict JSON object of at most :data:`JSON_LIMIT_BYTES`; errors as of read_bytes."""
     try:
-        return parse_json(data)
+        return parse_json(read_bytes(path, limit=JSON_LIMIT_BYTES))
     except ValueError as error:
         raise DataError(f"{path} is not valid JSON: {error}") from None
 
 
 def check_schema(found: object, newest: int, what: str) -> None:
-    """Demand the schema version this program writes. Raises DataError naming ``what``."""
+    """Raise DataError, naming ``what``, for a schema version other than ``newest``."""
     if type(found) is int and found > newest:
         raise DataError(
             f"{what} has schema {found}; this hjepa reads up to {newest}",
@@ -138,59 +139,45 @@ def read_bytes(path: Path, *, limit: int | None = None) -> bytes:
 
 
 def make_durable(path: Path) -> None:
-    """Flush to the disk what was appended to ``path``, if it is there. Raises StorageError."""
-    try:
+    """Flush to the disk what was appended to ``path``, if it is there."""
+    with writing(path), contextlib.suppress(FileNotFoundError):
         with open(path, "rb") as file:
             os.fsync(file.fileno())
         _sync_directory(path.parent)
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise storage_error(path, error) from None
 
 
 def jsonable(value: Any) -> Any:
     """Return ``value`` as plain JSON data: numpy becomes lists, undefined numbers become null."""
+    return msgspec.json.decode(msgspec.json.encode(value, enc_hook=_plain))
+
+
+def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {str(key): jsonable(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [jsonable(entry) for entry in value]
-    if hasattr(value, "tolist"):
-        return jsonable(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    return value
+        return dict(value)
+    return os.fspath(value) if isinstance(value, os.PathLike) else value.tolist()
 
 
 def make_directory(path: Path) -> None:
-    """Create ``path`` and its parents if needed. Raises StorageError."""
-    try:
+    """Create ``path`` and its parents if needed."""
+    with writing(path):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(path, error) from None
 
 
 def next_directory(parent: Path, prefix: str = "") -> Path:
-    """Create ``parent/<prefix>0001``, or the number after the highest. Raises StorageError."""
+    """Create ``parent/<prefix>0001``, or the number after the highest."""
     make_directory(parent)
     pattern = re.compile(re.escape(prefix) + r"(\d{4,})")
-    number = max((int(m[1]) for m in map(pattern.fullmatch, list_names(parent)) if m), default=0)
-    while True:
-        number += 1
+    last = max((int(m[1]) for m in map(pattern.fullmatch, list_names(parent)) if m), default=0)
+    for number in itertools.count(last + 1):  # another process may take one in between
         directory = parent / f"{prefix}{number:04d}"
-        try:
+        with writing(directory), contextlib.suppress(FileExistsError):
             directory.mkdir()
-            return directory
-        except FileExistsError:
-            continue  # another process took this number in between
-        except OSError as error:
-            raise storage_error(directory, error) from None
+            break
+    return directory
 
 
 def list_names(directory: Path) -> list[str]:
-    """Return the sorted names in ``directory``; none if it is not there. Raises StorageError."""
+    """Return the sorted names in ``directory``; none if it is not there."""
     try:
         return sorted(os.listdir(directory))
     except FileNotFoundError:
@@ -200,10 +187,7 @@ def list_names(directory: Path) -> list[str]:
 
 
 class _Lock(io.FileIO):
-    """A lock file that says who holds it, and nothing any more once it is given back.
-
-    What a directory holds in the end must not depend on who made it.
-    """
+    """It says who holds it, and nothing once given back: directories do not show who made them."""
 
     held = False
 
@@ -224,24 +208,22 @@ def lock_directory(directory: Path) -> IO[bytes]:
         LockedError: another process holds it.
         StorageError: not writable.
     """
-    try:
+    with writing(directory):
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW  # never write to where a link leads
         file = _Lock(os.open(directory / LOCK_FILE, flags, 0o666), "r+")
-    except OSError as error:
-        raise storage_error(directory, error) from None
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        found = _HOLDER.fullmatch(file.read(100) or b"")
-        file.close()
-        raise LockedError(
-            f"another process is working in {directory}"
-            + (f": {found[0].decode()}" if found else ""),
-            hint="wait until it has ended, or choose another place with --out DIR",
-        ) from None
-    except OSError as error:
-        file.close()
-        raise storage_error(directory, error) from None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            with file:
+                found = _HOLDER.fullmatch(file.read(100) or b"")
+            raise errors.LockedError(
+                f"another process is working in {directory}"
+                + (f": {found[0].decode()}" if found else ""),
+                hint="wait until it has ended, or choose another place with --out DIR",
+            ) from None
+        except OSError:
+            file.close()
+            raise
     file.held = True
     with contextlib.suppress(OSError):  # a full disk does not unlock the directory
         file.truncate(0)  # what a killed holder has left
@@ -252,11 +234,9 @@ def lock_directory(directory: Path) -> IO[bytes]:
 
 @contextlib.contextmanager
 def taking_turns(directory: Path) -> Iterator[None]:
-    """Let one process after the other add to a file in ``directory``. Raises StorageError."""
-    try:
+    """Let one process after the other add to a file in ``directory``."""
+    with writing(directory):
         handle = os.open(directory, os.O_RDONLY)
-    except OSError as error:
-        raise storage_error(directory, error) from None
     try:
         with contextlib.suppress(OSError):  # some network disks lock no directories
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -268,28 +248,44 @@ def taking_turns(directory: Path) -> Iterator[None]:
 def sweep_temporaries(directory: Path) -> None:
     """Delete what killed writers left behind: temporaries whose process is gone."""
     for name in list_names(directory):
-        match = _TEMPORARY.fullmatch(name)
-        if match and not _writing(int(match[1])):
+        if match := TEMPORARY.fullmatch(name):
+            try:
+                if (pid := int(match[1])) != os.getpid():  # our own are never open meanwhile
+                    os.kill(pid, 0)
+                    continue
+            except (ProcessLookupError, OverflowError):
+                pass
+            except PermissionError:
+                continue
             with contextlib.suppress(OSError):
                 (directory / name).unlink()
 
 
-def is_temporary(name: str) -> bool:
-    """Tell whether ``name`` is a half-written file of :func:`write_bytes`."""
-    return _TEMPORARY.fullmatch(name) is not None
+def refuse_foreign(directory: Path, kind: str, is_ours: Callable[[str], bool]) -> None:
+    """Raise UsageError if a directory holds something that belongs to no ``kind`` of ours."""
+    for name in list_names(directory):
+        if name != LOCK_FILE and not TEMPORARY.fullmatch(name) and not is_ours(name):
+            raise errors.UsageError(
+                f"{directory} is not empty and not an hjepa {kind}: it holds '{name}'",
+                hint="choose a new or empty directory with --out DIR",
+            )
 
 
-def storage_error(path: Path, error: OSError) -> StorageError:
-    """Turn an OSError on ``path`` into one line with the next step."""
-    if error.errno in _NO_SPACE:
-        hint = f"free some disk space, then {_AGAIN}"
-    else:
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn every OSError inside the ``with`` block into a StorageError: one line, the next step."""
+    try:
+        yield
+    except OSError as error:
         hint = "choose a directory that you may write to with --out DIR"
-    return StorageError(f"cannot write {path}: {error.strerror or error}", hint=hint)
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            hint = f"free some disk space, then {_AGAIN}"
+        reason = error.strerror or error
+        raise StorageError(f"cannot write {path}: {reason}", hint=hint) from None
 
 
 def check_free_space(directory: Path, size_bytes: int) -> None:
-    """Refuse to begin what the disk cannot hold. Raises StorageError."""
+    """Raise StorageError before the work if the disk cannot hold it."""
     free_bytes = shutil.disk_usage(directory).free
     if free_bytes < size_bytes:
         raise StorageError(
@@ -299,23 +295,23 @@ def check_free_space(directory: Path, size_bytes: int) -> None:
 
 
 def point_to(command: str, error: BaseException | None) -> None:
-    """Let a hint to repeat the command name the one that goes on: without --out, the same one
-    begins again in a new directory.
-    """
-    if isinstance(error, HjepaError) and (error.hint or "").endswith(_AGAIN):
+    """Replace "run the same command again", which begins anew without --out, by what resumes."""
+    if isinstance(error, errors.HjepaError) and (error.hint or "").endswith(_AGAIN):
         error.hint = f"{(error.hint or '').removesuffix(_AGAIN)}{command}"
 
 
-def _writing(pid: int) -> bool:
-    if pid == os.getpid():
-        return False  # our own writes are never open while a directory is being opened
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return True
+_SPECIAL = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+_SPECIAL |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "a device")
+
+
+def _refuse_special(path: Path, kinds: Mapping[int, str] = _SPECIAL) -> None:
+    """Raise StorageError for what is there and would be replaced, not filled."""
+    with writing(path), contextlib.suppress(FileNotFoundError):
+        if kind := kinds.get(stat.S_IFMT(path.lstat().st_mode)):
+            raise StorageError(
+                f"cannot write {path}: it is {kind}, not a regular file",
+                hint="choose a regular file or a new one with --out FILE",
+            )
 
 
 def _sync_directory(directory: Path) -> None:
@@ -328,7 +324,6 @@ def _sync_directory(directory: Path) -> None:
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys = dict(pairs)
-    if len(keys) != len(pairs):
+    if len(keys := dict(pairs)) != len(pairs):
         raise ValueError("duplicate keys")
     return keys

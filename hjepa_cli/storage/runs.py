@@ -1,13 +1,14 @@
 """Run directories: what a stage was asked, what happened, and the result, written last.
 
 ``runs/<stage>/<nnnn>/`` holds ``config.toml`` (fully resolved, usable with ``--config``),
-``environment.json`` (stage, versions, command, inputs), ``metrics.csv`` (no time, host or path),
-``events.jsonl`` (timings), the checkpoints of the stage, and ``result.json`` once it is finished.
+``environment.json`` (stage, versions, plugins, command, inputs), ``metrics.csv`` (no time, host or
+path), ``events.jsonl`` (timings), the checkpoints of the stage, and ``result.json`` once it is
+finished.
 """
 
 import contextlib
 import csv
-import importlib.metadata
+import hashlib
 import io
 import json
 import os
@@ -16,17 +17,18 @@ import shlex
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, Self
 
-from hjepa_cli import __version__
 from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code
-from hjepa_cli.config.settings import Settings, dotted, load_settings
+from hjepa_cli.compute.versions import TRAINED_WITH, versions
+from hjepa_cli.config.schema import Settings, dotted
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
-from hjepa_cli.storage import files, tracking
+from hjepa_cli.plugins import Source, in_force
+from hjepa_cli.storage import files, seals, tracking
 
 ROOT = Path("runs")
 CONFIG = "config.toml"
@@ -36,24 +38,21 @@ EVENTS = "events.jsonl"
 RESULT = "result.json"
 ASKED = ("remeasure", "verify")  # flags that are work, which a finished run has done or has not
 
-SCHEMA = 2  # of environment.json; 1 had neither a schema nor inputs
+SCHEMA = 3  # of environment.json; 1 had neither a schema nor inputs, 2 no settings
+RESULT_SCHEMA = 2  # 1 had neither a schema nor a seal
 
-_PACKAGES = ("torch", "numpy", "scipy", "pymunk", "safetensors", "typer", "rich")
+_SEALED = {"schema", "files", seals.SEAL}  # keys of result.json that are no result
+_RECORDED = (*TRAINED_WITH, "scipy", "pymunk", "safetensors", "typer", "rich")
 
 
 class Run:
-    """A locked run directory; use it as a context manager.
-
-    Attributes:
-        directory: where everything is.
-        result: the result of a finished run, else ``None``: nothing is left to do.
-        resumed: the directory was there before, from an interrupted run.
-    """
+    """It is a locked run directory; use it as a context manager."""
 
     def __init__(self, directory: Path, lock: IO[bytes]) -> None:
         self.directory = directory
-        self.result: dict[str, Any] | None = None
-        self.resumed = False
+        self.result: dict[str, Any] | None = None  # of a finished run: nothing is left to do
+        self.settings: dict[str, Any] = {}  # as config.toml has them, once it is open
+        self.resumed = False  # the directory was there before, from an interrupted run
         self._lock = lock
         self._track: tracking.Tracker | None = None
 
@@ -64,8 +63,6 @@ class Run:
         out: Path | None,
         settings: Mapping[str, Any],
         inputs: Mapping[str, Any] | None = None,
-        *,
-        root: Path = ROOT,
     ) -> Self:
         """Open ``out``, or a new ``runs/<stage>/<nnnn>``, for this process alone.
 
@@ -75,7 +72,6 @@ class Run:
             settings: resolved settings (:meth:`hjepa_cli.config.settings.Settings.as_dict`).
             inputs: what else the stage was given, for ``hjepa resume``: files by
                 :func:`describe_input`, flags as they are.
-            root: the parent of the automatic directories.
 
         Raises:
             UsageError: ``out`` holds something else, or a run with other settings or input files.
@@ -84,12 +80,9 @@ class Run:
             MissingInputError: ``HJEPA_LOG`` asks for a package that is not installed.
         """
         track = tracking.requested()
-        if out is None:
-            directory = files.next_directory(root / stage)
-        else:
-            directory = out
-            files.make_directory(directory)
-            check_ours(directory)
+        directory = out or files.next_directory(ROOT / stage)
+        files.make_directory(directory)
+        check_ours(directory)
         run = cls(directory, files.lock_directory(directory))
         run._track = track(directory) if track else None
         try:
@@ -101,11 +94,11 @@ class Run:
 
     @classmethod
     def follow(cls, out: Path | None) -> Self:
-        """What another process of the same training has open, to be read alone."""
+        """Open for reading alone what another process of the same training writes."""
         run = cls(out or ROOT, open(os.devnull, "rb"))
         run.resumed = out is not None and run.path(CONFIG).exists()
         if out is not None and run.path(RESULT).exists():
-            run.result = files.read_json(run.path(RESULT))
+            run.result = read_result(out)
         return run
 
     def path(self, name: str) -> Path:
@@ -119,35 +112,39 @@ class Run:
 
     def metric(self, row: Mapping[str, int | float | str | None]) -> None:
         """Append a row to ``metrics.csv``; every row has the columns of the first one."""
-        columns = self._columns()
-        if columns is None:
-            self._append(METRICS, _csv_line(row))
-        elif columns != list(row):
+        path, columns, lines = self.path(METRICS), None, io.StringIO()
+        with files.writing(path), contextlib.suppress(FileNotFoundError):
+            with open(path, encoding="utf-8", newline="") as file:
+                columns = next(csv.reader(file), None)
+        if columns not in (None, list(row)):
             raise ValueError(f"metrics.csv has columns {columns}, not {list(row)}")
-        self._append(METRICS, _csv_line([_cell(value) for value in row.values()]))
+        cells = [float(cell) if isinstance(cell, float) else cell for cell in row.values()]
+        table = csv.writer(lines, lineterminator="\n")
+        table.writerows([list(row), cells] if columns is None else [cells])
+        self._append(METRICS, lines.getvalue())
         if self._track is not None:
             self._track(row)
 
     @property
     def metrics(self) -> str:
-        """The text of ``metrics.csv``; assigned, it puts the file back to an earlier state."""
+        """Return the text of ``metrics.csv``; assigned, it puts back an earlier one."""
         return "".join(_whole_lines(self.path(METRICS)))
 
     @metrics.setter
     def metrics(self, text: str) -> None:
         files.write_text(self.path(METRICS), text)
 
-    @property
-    def continue_command(self) -> str:
-        """What takes this run up again."""
-        return f"{torchrun.program()} resume {shlex.quote(str(self.directory))}"
+    continue_command = property(lambda self: continue_command(self.directory))
 
     def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
         """Write ``result.json``, which makes the run a finished one, and return what it holds."""
         for name in (METRICS, EVENTS):  # appended to: a power loss must not leave a result alone
             files.make_durable(self.path(name))
         self.result = files.jsonable(result)
-        files.write_json(self.path(RESULT), self.result)
+        if taken := self.result.keys() & _SEALED:
+            raise ValueError(f"a result may not use the reserved keys {sorted(taken)}")
+        seal = {"schema": RESULT_SCHEMA, "files": _tables(self.directory)}
+        files.write_json(self.path(RESULT), seals.sealed({**self.result, **seal}))
         return self.result
 
     def close(self) -> None:
@@ -157,12 +154,7 @@ class Run:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.close()
         files.point_to(self.continue_command, error)
         if isinstance(error, Interrupted):  # of a run inside this one, perhaps
@@ -175,22 +167,28 @@ class Run:
             ) from None
 
     def _open(self, stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
+        self.settings = files.jsonable({key: settings[key] for key in settings if key != "preset"})
         if self.path(CONFIG).exists():
             self.resumed = True
             recorded = read_environment(self.directory)
+            check_plugins(self.directory, recorded)
             if recorded["stage"] != stage:
                 raise UsageError(
                     f"{self.directory} holds a run of '{recorded['stage']}', not of '{stage}'",
                     hint="choose another directory with --out DIR",
                 )
             finished = self.path(RESULT).exists()
-            differences = _differences(_settings(self.directory, recorded), settings)
+            try:
+                kept = load_recorded(recorded.get("preset"), self.directory).as_dict()
+            except UsageError:  # it has settings that this version has not: they are differences
+                kept = read_config(self.directory)
+            changed = differences(kept, settings)
             if recorded["schema"] > 1:
-                differences += _differences(_digests(recorded["inputs"]), _digests(inputs))
-            if differences:
+                changed += differences(*map(_digests, (recorded["inputs"], inputs)))
+            if changed:
                 raise UsageError(
                     f"{self.directory} holds {'a finished' if finished else 'an unfinished'} run "
-                    f"with other settings: {'; '.join(differences)}",
+                    f"with other settings: {'; '.join(changed)}",
                     hint=f"{self.continue_command} {'shows' if finished else 'continues'} it as it "
                     "is; or choose another --out DIR",
                 )
@@ -202,8 +200,10 @@ class Run:
                         f"{self.directory} holds a run finished without --{further[0]}",
                         hint="choose another --out DIR",
                     )
-                self.result = files.read_json(self.path(RESULT))
+                self.result = read_result(self.directory)
                 return
+            if recorded["schema"] < SCHEMA:
+                seals.warn(self.path(CONFIG))
             if further:
                 done.update(dict.fromkeys(further, True))
                 files.write_json(self.path(ENVIRONMENT), recorded)
@@ -212,67 +212,106 @@ class Run:
                     files.write_text(self.path(name), "".join(_whole_lines(self.path(name))))
             self.event("resumed")
             return
-        files.write_json(self.path(ENVIRONMENT), environment(stage, settings, inputs))
+        environment = {  # what a run depends on besides its settings
+            "schema": SCHEMA,
+            "stage": stage,
+            "inputs": inputs,
+            "plugins": [{"name": one.name, "sha256": one.sha256} for one in in_force()],
+            "preset": settings.get("preset"),
+            "settings": self.settings,
+            "command": sys.argv,
+            "versions": versions(_RECORDED),
+            "system": platform.system(),
+            "machine": platform.machine(),
+            "cpus": os.cpu_count(),
+        }
+        files.write_json(self.path(ENVIRONMENT), environment)
         files.write_text(self.path(CONFIG), to_toml(settings))
         self.event("started")
 
-    def _columns(self) -> list[str] | None:
-        try:
-            with open(self.path(METRICS), encoding="utf-8", newline="") as file:
-                return next(csv.reader(file), None)
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise files.storage_error(self.path(METRICS), error) from None
-
     def _append(self, name: str, text: str) -> None:
-        try:
-            with open(self.path(name), "a", encoding="utf-8", newline="") as file:
-                file.write(text)
-        except OSError as error:
-            raise files.storage_error(self.path(name), error) from None
+        path = self.path(name)
+        with files.writing(path), open(path, "a", encoding="utf-8", newline="") as file:
+            file.write(text)
 
 
 def newest_run(
-    stage: str, predicate: Callable[[Path], bool] = lambda directory: True, root: Path = ROOT
+    stage: str, predicate: Callable[[Path], bool] = lambda directory: True
 ) -> Path | None:
-    """Return the most recently finished ``runs/<stage>/*`` that satisfies ``predicate``, if any.
-
-    Runs whose records are damaged or of another version do not.
-    """
-    for directory in finished_runs(stage, root=root):
+    """Return the newest finished ``runs/<stage>/*`` that is not damaged and fits."""
+    for directory in finished_runs(stage):
         with contextlib.suppress(DataError, MissingInputError, LookupError, TypeError):
             if predicate(directory):
                 return directory
     return None
 
 
-def finished_runs(*stages: str, root: Path = ROOT) -> list[Path]:
+def finished_runs(*stages: str) -> list[Path]:
     """Return the finished ``runs/<stage>/*`` of some stages, newest first."""
-    finished = []
-    for place in (root / stage for stage in stages):
-        for directory in (place / name for name in files.list_names(place)):
-            if (directory / RESULT).is_file():
-                finished.append(((directory / RESULT).stat().st_mtime_ns, directory))
-    return [directory for _, directory in sorted(finished, reverse=True)]
+    places = (ROOT / stage for stage in stages)
+    every = (place / name for place in places for name in files.list_names(place))
+    finished = (directory for directory in every if (directory / RESULT).is_file())
+    return sorted(finished, key=lambda one: ((one / RESULT).stat().st_mtime_ns, one), reverse=True)
 
 
 def read_result(directory: Path) -> dict[str, Any]:
-    """Return the result of a finished run. Raises MissingInputError or DataError."""
-    return files.read_json(directory / RESULT)
+    """Return the result of a finished run, its seal and those of its tables checked.
+
+    A run of an older version has none: that is an :class:`~hjepa_cli.errors.Unsealed`
+    warning.
+
+    Raises:
+        MissingInputError: not a finished run.
+        DataError: damaged, or changed after it was written.
+    """
+    path, environment = directory / RESULT, read_environment(directory)
+    again = f"run it again: hjepa {environment['stage']} --config {directory / CONFIG}"
+    result = seals.read(path, RESULT_SCHEMA, again)
+    if seals.SEAL not in result:
+        if environment["schema"] == SCHEMA:
+            seals.check(result, path, again)
+        seals.warn(path)
+        return {key: result[key] for key in result if key != "schema"}
+    tables, now = result.get("files"), _tables(directory)
+    if not isinstance(tables, dict):
+        raise DataError(f"{path} does not name its tables", hint=again)
+    for name in tables:
+        if tables[name] != now.get(name):
+            what = "was changed after it was written" if name in now else "is gone"
+            raise DataError(f"{directory / name} {what}", hint=again)
+    return {key: result[key] for key in result if key not in _SEALED}
+
+
+def _tables(directory: Path) -> dict[str, str]:
+    """Return the sha256 of each table of a run by name."""
+    tables = (path for path in directory.glob("*.csv") if path.is_file())
+    return {path.name: hashlib.sha256(files.read_bytes(path)).hexdigest() for path in tables}
 
 
 def read_config(directory: Path) -> dict[str, Any]:
-    """Return the resolved settings of a run, without the preset's name. Raises DataError."""
+    """Return the resolved settings of a run, without the preset's name.
+
+    Raises:
+        DataError: no TOML, or not the settings that ``environment.json`` says it was begun with.
+    """
     path = directory / CONFIG
     try:
-        return tomllib.loads(files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode())
+        found = tomllib.loads(files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode())
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid TOML: {error}") from None
+    if (directory / ENVIRONMENT).exists():
+        recorded = read_environment(directory)
+        if recorded["schema"] == SCHEMA and (changed := differences(recorded["settings"], found)):
+            raise DataError(
+                f"{path} was changed after the run was begun: {'; '.join(changed)}",
+                hint=f"put it back, or for a run with it: hjepa {recorded['stage']} "
+                f"--config {path} --out DIR",
+            )
+    return found
 
 
 def read_environment(directory: Path) -> dict[str, Any]:
-    """Return what :func:`environment` recorded of a run; of schema 1, with no inputs.
+    """Return what a run depends on besides its settings; of schema 1, without inputs.
 
     Raises:
         MissingInputError: not a run directory.
@@ -282,23 +321,54 @@ def read_environment(directory: Path) -> dict[str, Any]:
     if not path.exists():
         raise MissingInputError(f"{directory} is not a run directory: no {ENVIRONMENT}")
     recorded = {"schema": 1, **files.read_json(path)}
-    if type(recorded["schema"]) is int and recorded["schema"] == 1:
+    schema = recorded["schema"]
+    if not (type(schema) is int and 0 < schema < SCHEMA):
+        files.check_schema(schema, SCHEMA, f"run {directory}")
+    if schema == 1:
         recorded["inputs"] = {}
-    else:
-        files.check_schema(recorded["schema"], SCHEMA, f"run {directory}")
-    if not isinstance(recorded.get("stage"), str) or not isinstance(recorded.get("inputs"), dict):
+    plugins = recorded.setdefault("plugins", [])
+    named = isinstance(plugins, list) and all(
+        isinstance(one, dict) and all(isinstance(one.get(key), str) for key in ("name", "sha256"))
+        for one in plugins
+    )
+    stage, inputs, settings = (recorded.get(key) for key in ("stage", "inputs", "settings"))
+    known = isinstance(settings, dict) or recorded["schema"] < SCHEMA
+    if not (named and known and isinstance(stage, str) and isinstance(inputs, dict)):
         raise DataError(f"{path} lacks fields or has malformed ones")
     return recorded
 
 
+def check_plugins(directory: Path, recorded: Mapping[str, Any]) -> None:
+    """Raise UsageError unless the plugins are in force that a run was begun with; it loads none."""
+    now = {source.sha256: source.name for source in in_force()}
+    begun_with = [Source(one["name"], one["sha256"]) for one in recorded["plugins"]]
+    for plugin in begun_with:
+        if plugin.sha256 not in now:
+            why = "has changed since" if plugin.name in now.values() else "is not in force"
+            install = f"pip install {plugin.name.replace(' ', '==')}"
+            raise UsageError(
+                f"{directory} was begun with plugin {plugin.name}, which {why}",
+                hint=install if plugin.installed else continue_command(directory, begun_with),
+            )
+
+
+def continue_command(directory: Path, plugins: Iterable[Source] | None = None) -> str:
+    """Return what takes a run up again, with its plugins, or those that are in force now."""
+    words = ["resume", str(directory)]
+    for source in in_force() if plugins is None else plugins:
+        if not source.installed:
+            words += ["--plugin", source.name]
+    return f"{torchrun.program()} {shlex.join(words)}"
+
+
 def version_of(recorded: Mapping[str, Any]) -> str | None:
-    """The version of this program that made a run, of what :func:`read_environment` returns."""
-    versions = recorded.get("versions")
-    return versions.get("hjepa") if isinstance(versions, dict) else None
+    """Return the version of this program that made a run, of :func:`read_environment`."""
+    found = recorded.get("versions")
+    return found.get("hjepa") if isinstance(found, dict) else None
 
 
 def describe_input(path: Path, digest: str) -> dict[str, str]:
-    """How a run remembers a file or directory that it reads: where it was and what it was."""
+    """Return how a run remembers a file or directory that it reads: where and what it was."""
     return {"path": str(path.absolute()), "sha256": digest}
 
 
@@ -307,79 +377,35 @@ def to_toml(settings: Mapping[str, Any]) -> str:
 
     The preset is a comment: its values are all written out, and it is no setting.
     """
-    lines = [f"# Resolved from preset {settings.get('preset', 'default')}."]
-    sections = {}
-    for key, value in settings.items():
+    text, sections = f"# Resolved from preset {settings.get('preset', 'default')}.\n", ""
+    for name, value in settings.items():
         if isinstance(value, Mapping):
-            sections[key] = value
-        elif key != "preset":
-            lines.append(f"{key} = {_toml(value)}")
-    for name, section in sections.items():
-        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in section.items())]
-    return "\n".join(lines) + "\n"
-
-
-def environment(
-    stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return what a run depended on besides its settings: inputs, versions, machine, command."""
-    versions = {"hjepa": __version__, "python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = "not installed"
-    return {
-        "schema": SCHEMA,
-        "stage": stage,
-        "inputs": inputs,
-        "preset": settings.get("preset"),
-        "command": sys.argv,
-        "versions": versions,
-        "system": platform.system(),
-        "machine": platform.machine(),
-        "cpus": os.cpu_count(),
-    }
+            lines = (f"{key} = {_toml(one)}\n" for key, one in value.items())
+            sections += f"\n[{name}]\n{''.join(lines)}"
+        elif name != "preset":
+            text += f"{name} = {_toml(value)}\n"
+    return text + sections
 
 
 def check_ours(directory: Path) -> None:
-    """Check that a directory, if it is there, is empty or a run.
-
-    Raises:
-        UsageError: it holds something else.
-    """
-    entries = files.list_names(directory)
-    for name in entries if CONFIG not in entries else ():
-        if name not in (files.LOCK_FILE, ENVIRONMENT) and not files.is_temporary(name):
-            raise UsageError(
-                f"{directory} is not empty and not an hjepa run: it holds '{name}'",
-                hint="choose a new or empty directory with --out DIR",
-            )
+    """Raise UsageError unless a directory is absent, empty or a run."""
+    if not (directory / CONFIG).exists():
+        files.refuse_foreign(directory, "run", lambda name: name == ENVIRONMENT)
 
 
-def _settings(directory: Path, recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a run, complete: what its version had not is as its preset says."""
-    values, preset = read_config(directory), recorded.get("preset")
-    try:
-        known = preset if isinstance(preset, str) else None
-        return load_recorded(known, directory).as_dict()
-    except UsageError:  # it has settings that this version has not: they are differences
-        return values
+def load_recorded(preset: object, directory: Path) -> Settings:
+    """Load the settings of a run; what its version had not is as its preset says.
 
-
-def load_recorded(preset: str | None, directory: Path) -> Settings:
-    """Load the settings of a run; before there was a warm-up, loops were scored from the start.
-
-    Raises:
-        As :func:`~hjepa_cli.config.settings.load_settings`.
+    Before there was a warm-up, loops were scored from the start. Errors are those of
+    :func:`~hjepa_cli.config.settings.load_settings`.
     """
     protocol = read_config(directory).get("protocol", {})
     scored_all = isinstance(protocol, Mapping) and "warmup_steps" not in protocol
     flags = {"protocol.warmup_steps": 0} if scored_all else {}
-    return load_settings(preset, directory / CONFIG, flags)
+    return load_settings(preset if isinstance(preset, str) else None, directory / CONFIG, flags)
 
 
-def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Name the settings that differ, as ``section.key = old, not new``."""
     before, after = dotted(old), dotted(files.jsonable(new))
     if later := after.keys() - before.keys():  # settings that there were none of had their default
@@ -393,7 +419,6 @@ def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 
 def _digests(inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of the input files; where they are may change."""
     return {
         name: value.get("sha256") for name, value in inputs.items() if isinstance(value, Mapping)
     }
@@ -405,18 +430,6 @@ def _toml(value: Any) -> str:
     if isinstance(value, float):
         return repr(float(value))
     return json.dumps(value)  # strings, integers and booleans are the same in TOML
-
-
-def _cell(value: int | float | str | None) -> str:
-    if value is None:
-        return ""
-    return repr(float(value)) if isinstance(value, float) else str(value)
-
-
-def _csv_line(cells: Mapping[str, Any] | list[str]) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerow(cells)
-    return buffer.getvalue()
 
 
 def _whole_lines(path: Path) -> list[str]:

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.errors import DataError, HjepaError
-from hjepa_cli.storage import files
+from hjepa_cli.storage import files, seals
 
 LOG = "collecting.jsonl"
-SCHEMA = 1  # of its first line; none was written there at first, which is 1 too
+SCHEMA = 2  # of its first line; 1, or none, had no seal
 NAME = re.compile(r"shard-\d{5,9}\.safetensors")
 
 Described = dict[str, Any]
@@ -25,7 +25,7 @@ Described = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
-    """Trajectories ``start`` … ``stop`` − 1 of a split, in one file."""
+    """It holds trajectories ``start`` … ``stop`` − 1 of a split, in one file."""
 
     number: int
     split: str
@@ -34,30 +34,24 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """The file's name."""
+        """Return the name of the file."""
         return f"shard-{self.number:05d}.safetensors"
 
 
 def cut(sizes: Mapping[str, int], trajectories: int) -> list[Shard]:
     """Cut splits of ``sizes`` trajectories into shards of at most ``trajectories``."""
-    shards: list[Shard] = []
-    for split, size in sizes.items():
-        for start in range(0, size, trajectories):
-            stop = min(start + trajectories, size)
-            shards.append(Shard(len(shards), split, start, stop))
-    return shards
+    starts = ((split, start) for split in sizes for start in range(0, sizes[split], trajectories))
+    return [
+        Shard(number, split, start, min(start + trajectories, sizes[split]))
+        for number, (split, start) in enumerate(starts)
+    ]
 
 
 class ShardLog:
-    """The log of the shards in ``directory``.
+    """It logs the shards in ``directory``, which is locked for this process.
 
-    Args:
-        directory: locked for this process.
-        task: what is collected, plain JSON data; a log that is there keeps its own: see
-            :func:`read_task`.
-
-    Attributes:
-        done: finished shards by name, as :meth:`add` was told; their files are intact.
+    ``task``, plain JSON data, says what is collected; a log that is there keeps its own. ``done``
+    has what :meth:`add` was given, by name, of the finished shards whose files are intact.
 
     Raises:
         DataError: the log is damaged, or of a newer schema.
@@ -68,7 +62,7 @@ class ShardLog:
         self._path = directory / LOG
         self.done: dict[str, Described] = {}
         if not self._path.exists():  # written at once: it never lacks its first line
-            files.write_bytes(self._path, _line({"schema": SCHEMA, **task}))
+            files.write_bytes(self._path, _line(seals.sealed({**task, "schema": SCHEMA})))
             return
         read_task(directory)
         first, *lines = files.read_bytes(self._path).split(b"\n")
@@ -76,55 +70,44 @@ class ShardLog:
             try:
                 described = files.parse_json(line)
                 name, digest = described["name"], described["sha256"]
-                if NAME.fullmatch(name) and _intact(directory / name, digest):
-                    self.done[described["name"]] = described
+                path = directory / name
+                if not NAME.fullmatch(name) or not path.is_file():
+                    continue
+                if hashlib.sha256(files.read_bytes(path)).hexdigest() == digest:
+                    self.done[name] = described
             except (ValueError, KeyError, TypeError, HjepaError):
                 continue  # collected again
         files.write_bytes(self._path, first + b"\n" + b"".join(map(_line, self.done.values())))
 
     def add(self, described: Described) -> None:
         """Record a finished shard: ``name``, ``sha256`` and whatever else the manifest needs."""
-        try:
-            with open(self._path, "ab") as file:
-                file.write(_line(described))
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise files.storage_error(self._path, error) from None
+        with files.writing(self._path), open(self._path, "ab") as file:
+            file.write(_line(described))
+            file.flush()
+            os.fsync(file.fileno())
         self.done[described["name"]] = described
 
 
 def remove_log(directory: Path) -> None:
-    """The dataset is complete, if it was not so before. Raises StorageError."""
-    path = directory / LOG
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise files.storage_error(path, error) from None
+    """Delete the progress log once the manifest exists. Raises StorageError."""
+    with files.writing(directory / LOG):
+        (directory / LOG).unlink(missing_ok=True)
 
 
 def read_task(directory: Path) -> dict[str, Any]:
-    """Return what is being collected in ``directory``.
-
-    Raises:
-        DataError: the log is damaged, or of a newer schema.
-    """
+    """Return what is being collected in ``directory``; DataError where its log is damaged."""
     path = directory / LOG
+    again = f"delete {directory} to collect again, or choose another --out DIR"
     data = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES)
     try:
-        task = {"schema": SCHEMA, **files.parse_json(data.split(b"\n")[0])}
+        first = files.parse_json(data.split(b"\n")[0])
     except ValueError as error:
-        raise DataError(
-            f"{path} is damaged: {error}",
-            hint=f"delete {directory} to collect again, or choose another --out DIR",
-        ) from None
-    files.check_schema(task.pop("schema"), SCHEMA, f"unfinished dataset {directory}")
-    return task
+        raise DataError(f"{path} is damaged: {error}", hint=again) from None
+    task = seals.verified(first, SCHEMA, path, again)
+    if seals.SEAL not in task:
+        seals.warn(path)
+    return {key: task[key] for key in task if key not in ("schema", seals.SEAL)}
 
 
 def _line(value: Mapping[str, Any]) -> bytes:
     return files.canonical_json(value).encode() + b"\n"
-
-
-def _intact(path: Path, digest: str) -> bool:
-    return path.is_file() and hashlib.sha256(files.read_bytes(path)).hexdigest() == digest

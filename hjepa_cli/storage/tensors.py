@@ -4,22 +4,22 @@ safetensors 0.8 silently scrambles arrays that are not C-contiguous, and more th
 key makes the bytes random. All array files of this program therefore pass through here.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors import numpy as safetensors_numpy
 
 from hjepa_cli.errors import DataError
-from hjepa_cli.storage.files import canonical_json, parse_json
+from hjepa_cli.storage.files import parse_json
 
 METADATA_KEY = "hjepa"
 HEADER_LIMIT_BYTES = 2**20
 DTYPES = ("float32", "int64", "uint8")
+
+Shapes = Mapping[str, tuple[str, tuple[int, ...]]]
+"""It maps names of tensors to dtype and shape."""
 
 _LFS_POINTER = b"version https://git-lfs"
 _MALFORMED = (
@@ -56,7 +56,10 @@ def unpack(data: bytes, path: Path) -> tuple[dict[str, np.ndarray], str | None]:
     if data.startswith(_LFS_POINTER):
         raise DataError(f"{path} is a git-lfs pointer, not the file", hint="git lfs pull")
     try:
-        header = _header(data)
+        length = int.from_bytes(data[:8], "little")
+        if not length <= min(HEADER_LIMIT_BYTES, len(data) - 8):
+            raise ValueError("the header is longer than the file or the limit")
+        header = parse_json(data[8 : 8 + length])
         foreign = {entry["dtype"] for name, entry in header.items() if name != "__metadata__"}
         if foreign - {"F32", "I64", "U8"}:
             raise ValueError(f"unexpected dtype {', '.join(sorted(foreign))}")
@@ -74,31 +77,21 @@ def plain_array(array: np.ndarray, name: str) -> np.ndarray:
     return np.asarray(array, dtype=array.dtype.newbyteorder("="), order="C")
 
 
-def content_digest(metadata: Any, tensors: Mapping[str, np.ndarray]) -> str:
-    """Return the sha256 over the metadata, then each tensor's name, dtype, shape, bytes.
-
-    It covers the content, not the file: another writer of the same values has the same digest.
-    """
-    digest = hashlib.sha256(canonical_json(metadata).encode())
-    for name in sorted(tensors):
-        array = plain_array(tensors[name], name)
-        digest.update(canonical_json([name, array.dtype.name, array.shape]).encode())
-        digest.update(array.data if array.size else b"")
-    return digest.hexdigest()
-
-
 def non_finite(tensors: Mapping[str, np.ndarray]) -> str | None:
     """Return the name of the first tensor holding a NaN or an infinity, if any."""
-    return next((name for name in sorted(tensors) if not np.isfinite(tensors[name]).all()), None)
+    floats = (name for name in sorted(tensors) if tensors[name].dtype.kind == "f")
+    return next((name for name in floats if not np.isfinite(tensors[name]).all()), None)
 
 
-def _header(data: bytes) -> dict[str, Any]:
-    if len(data) < 8:
-        raise ValueError(f"only {len(data)} bytes")
-    length = int.from_bytes(data[:8], "little")
-    if length > min(HEADER_LIMIT_BYTES, len(data) - 8):
-        raise ValueError("the header is longer than the file or the limit")
-    try:
-        return parse_json(data[8 : 8 + length])
-    except json.JSONDecodeError:
-        raise ValueError("the header is not JSON") from None
+def difference(found: Mapping[str, np.ndarray], expected: Shapes) -> str | None:
+    """Name the first tensor that is missing, unexpected or of another dtype or shape, if any."""
+    for name in sorted(expected.keys() | found.keys()):
+        if name not in found:
+            return f"tensor '{name}' is missing"
+        if name not in expected:
+            return f"tensor '{name}' is unexpected"
+        (dtype, shape), has = expected[name], found[name]
+        if (has.dtype.name, has.shape) != (dtype, tuple(shape)):
+            has_text = f"{has.dtype.name} {has.shape}"
+            return f"tensor '{name}' is {has_text}; expected {dtype} {tuple(shape)}"
+    return None

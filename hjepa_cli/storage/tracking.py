@@ -18,14 +18,13 @@ Tracker = Callable[[Mapping[str, int | float | str | None]], None]
 
 
 def requested() -> Callable[[Path], Tracker] | None:
-    """What ``HJEPA_LOG`` asks for, if anything: from a run directory to its tracker.
+    """Return what makes the tracker of a run directory, if ``HJEPA_LOG`` asks for one.
 
     Raises:
         UsageError: an unknown logger.
         MissingInputError: its package is not installed.
     """
-    wanted = os.environ.get(VARIABLE, "")
-    if not wanted:
+    if not (wanted := os.environ.get(VARIABLE)):
         return None
     if wanted != "tensorboard":
         raise UsageError(
@@ -39,21 +38,21 @@ def requested() -> Callable[[Path], Tracker] | None:
             f"{VARIABLE}=tensorboard needs tensorboard, which is not installed",
             hint=f'pip install "hjepa[track]", or unset {VARIABLE}',
         ) from None
-    return lambda directory: _tensorboard(SummaryWriter, directory)
 
+    def tensorboard(directory: Path) -> Tracker:
+        writer: Any = None
 
-def _tensorboard(open_writer: Callable[..., Any], directory: Path) -> Tracker:
-    writer: Any = None
+        def track(row: Mapping[str, int | float | str | None]) -> None:
+            nonlocal writer
+            step = int(row.get("step") or 0)
+            if writer is None:  # what an interrupted run has logged beyond this step is discarded
+                writer = SummaryWriter(str(directory), purge_step=step)
+            group = f"{row['level']}/" if row.get("level") else ""
+            for name, value in row.items():
+                if name != "step" and isinstance(value, int | float):
+                    writer.add_scalar(group + name, value, step)
+            writer.flush()
 
-    def track(row: Mapping[str, int | float | str | None]) -> None:
-        nonlocal writer
-        step = int(row.get("step") or 0)
-        if writer is None:  # what an interrupted run has logged beyond this step is discarded
-            writer = open_writer(str(directory), purge_step=step)
-        group = f"{row['level']}/" if row.get("level") else ""
-        for name, value in row.items():
-            if name != "step" and isinstance(value, int | float):
-                writer.add_scalar(group + name, value, step)
-        writer.flush()
+        return track
 
-    return track
+    return tensorboard

@@ -14,17 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.errors import DataError, MissingInputError
-from hjepa_cli.storage import files
+from hjepa_cli.storage import files, runs, seals
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 
 CURVES_FILE = "curves.json"
+CURVES_SCHEMA = 2  # 1 had no seal
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 
 
 @dataclasses.dataclass(frozen=True)
 class ZooModel:
-    """A verified model: its checkpoint's metadata, and whether its measured curves belong to it."""
+    """It is verified; where it has measured curves they were measured on it."""
 
     name: str
     path: Path
@@ -48,19 +49,13 @@ def list_models() -> list[str]:
 
 
 def find_model(plant_name: str, strides: Sequence[int] = ()) -> Path | None:
-    """Return the checkpoint file of the zoo's hierarchy of a plant, if there is one.
-
-    The first one with ``strides`` (h, m, l); where no model has them, the first one.
-    """
+    """Return the file of the zoo's first hierarchy of a plant, rather one with these strides."""
     first = None
     for path in map(resolve_model, list_models()):
         metadata = load_checkpoint(path).metadata
-        architecture = metadata.get("architecture", {})
-        if (
-            metadata.get("plant") == plant_name
-            and architecture.get("kind", "hierarchy") == "hierarchy"
-        ):
-            if [architecture.get(name) for name in ("h", "m", "l")] == list(strides):
+        found = {"kind": "hierarchy"} | metadata.get("architecture", {})
+        if (metadata.get("plant"), found["kind"]) == (plant_name, "hierarchy"):
+            if [found.get(name) for name in ("h", "m", "l")] == list(strides):
                 return path
             first = first or path
     return first
@@ -75,20 +70,15 @@ def resolve_model(name_or_path: str | Path) -> Path:
     Raises:
         MissingInputError: neither; the message lists the zoo's names.
     """
-    text = str(name_or_path)
-    models = list_models()
-    if text in models:
-        return zoo_directory() / text / MODEL_FILE
-    path = Path(name_or_path)
-    if path.is_dir():
-        if (path / MODEL_FILE).is_file():
-            return path / MODEL_FILE
+    text, models = str(name_or_path), list_models()
+    path = zoo_directory() / text if text in models else Path(name_or_path)
+    if path.is_dir() and not (path / MODEL_FILE).is_file():
         raise MissingInputError(
             f"{path} holds no {MODEL_FILE}: not a finished training run",
             hint="name a run directory, a .safetensors file or a zoo model: hjepa models list",
         )
     if path.exists():
-        return path
+        return path / MODEL_FILE if path.is_dir() else path
     near = difflib.get_close_matches(text, models, n=1)
     suggestion = f"did you mean '{near[0]}'?" if near else f"the zoo has {', '.join(models) or '-'}"
     raise MissingInputError(
@@ -97,7 +87,9 @@ def resolve_model(name_or_path: str | Path) -> Path:
 
 
 def verify_model(name_or_path: str | Path) -> ZooModel:
-    """Load a model, check its sha256 and that ``curves.json`` beside it was measured on it.
+    """Load a model and check its sha256 and the seals beside it: of its curves and of its run.
+
+    A seal that an older version had not is an :class:`~hjepa_cli.errors.Unsealed` warning.
 
     Raises:
         MissingInputError: no such model.
@@ -107,12 +99,16 @@ def verify_model(name_or_path: str | Path) -> ZooModel:
     checkpoint = load_checkpoint(path)
     curves = path.with_name(CURVES_FILE)
     if curves.exists():
-        digest = files.read_json(curves).get("digest")
+        again = f"measure it again: hjepa eval --checkpoint {name_or_path} --remeasure"
+        document = seals.read(curves, CURVES_SCHEMA, again)
+        digest = document.get("digest")
         if not isinstance(digest, dict) or digest.get("checkpoint") != checkpoint.digest:
-            raise DataError(
-                f"{curves} was measured on another checkpoint than {path.name}",
-                hint=f"measure it again: hjepa eval --checkpoint {name_or_path} --remeasure",
-            )
+            reason = f"{curves} was measured on another checkpoint than {path.name}"
+            raise DataError(reason, hint=again)
+        if seals.SEAL not in document:
+            seals.warn(curves)
+    if path.with_name(runs.RESULT).exists() and path.with_name(runs.ENVIRONMENT).exists():
+        runs.read_result(path.parent)
     name = path.parent.name if path.name == MODEL_FILE else path.stem
     size = path.stat().st_size
     return ZooModel(name, path, size, checkpoint.digest, checkpoint.metadata, curves.exists())

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from command_line import ENVIRONMENT, assert_one_line_error, open_shell
 
-from hjepa_cli.config.checks import METHODS
 from hjepa_cli.config.settings import PRESETS, load_settings
+from hjepa_cli.plugins import METHODS
 
 PIPELINE = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
 
@@ -154,12 +154,12 @@ def test_a_plan_refuses_the_methods_that_the_command_would(shell, code, argument
 
 def test_a_plan_of_a_figure_refuses_models_of_different_seeds(shell, monkeypatch):
     from hjepa_cli.errors import DataError
-    from hjepa_cli.stages.model_set import Subject
+    from hjepa_cli.stages.model_set import ModelSet
 
     def refuse(subject):
         raise DataError("a figure of models that were trained with different seeds")
 
-    monkeypatch.setattr(Subject, "check_one_training_seed", refuse)
+    monkeypatch.setattr(ModelSet, "check_one_training_seed", refuse)
     refused(shell, 65, "eval", "--figure", "--dry-run", says=["different seeds"])
     assert shell("eval", "--dry-run").code == 0
 
@@ -322,7 +322,7 @@ def test_flag_without_its_value(shell):
 @pytest.mark.parametrize(
     ("text", "code", "says"),
     [
-        ("[collect]\ntrajectoris = 3\n", 2, "did you mean 'trajectories'"),
+        ("[collect]\ntrajectoris = 3\n", 2, "line 2; did you mean 'collect.trajectories'"),
         ("[colect]\n", 2, "collect"),
         ("[collect]\ntrajectories = 0\n", 2, "collect.trajectories = 0"),
         ("[collect]\ntrajectories = 2.5\n", 2, "collect.trajectories"),
@@ -330,8 +330,8 @@ def test_flag_without_its_value(shell):
         ("[collect]\nx_m = -0.1\n", 2, "collect.x_m"),
         ("seed = -1\n", 2, "seed"),
         ("[actor]\ndropout = 1.0\n", 2, "actor.dropout"),
-        ("[collect]\nsteps = 1\n", 2, "collect.steps = 1; expected at least 2"),
-        ("[encoder]\nbatch_frames = 1\n", 2, "encoder.batch_frames = 1; expected at least 2"),
+        ("[collect]\nsteps = 1\n", 2, "expected a whole number of at least 2"),
+        ("[encoder]\nbatch_frames = 1\n", 2, "encoder.batch_frames = 1 in c.toml, line 2"),
         ("[encoder]\nembedding = 7\n", 2, "encoder.embedding = 7; expected an even number"),
         ("[encoder]\nembedding = 1\n", 2, "encoder.embedding = 1; expected an even number"),
         ("[protocol]\ngaps = [5, 1]\n", 2, "protocol.gaps"),
@@ -368,7 +368,9 @@ def test_config_that_is_a_directory(shell):
 
 
 def write_tiny_dataset(directory, plant_name):
-    from hjepa_cli.core.datasets.dataset import Trajectories, write_dataset
+    from tiny_dataset import write_dataset
+
+    from hjepa_cli.core.datasets.dataset import Trajectories
     from hjepa_cli.core.plants.named import Camera
 
     rng = np.random.default_rng(1)

@@ -19,7 +19,7 @@ from command_line import ENVIRONMENT, ROOT, assert_one_line_error, open_shell
 from typer.main import get_command
 
 from hjepa_cli import __version__
-from hjepa_cli.cli.app import app
+from hjepa_cli.cli.builder import build
 from hjepa_cli.config.settings import PRESETS, load_settings
 from hjepa_cli.core.evaluation import load_search as scheduled
 from hjepa_cli.errors import (
@@ -45,7 +45,7 @@ HELP_LIMIT_S = 0.5
 
 def commands():
     """All commands by their full name."""
-    top = get_command(app)
+    top = get_command(build())
     for name, command in top.commands.items():
         yield name, command
         for sub_name, sub_command in getattr(command, "commands", {}).items():
@@ -150,20 +150,39 @@ def test_shared_options_are_everywhere(name):
         assert "--device" in flags
 
 
-def test_defaults_are_in_the_presets_and_not_in_the_signatures():
-    """A flag that is not given must change nothing, or --config could never set its value."""
+def test_a_flag_that_is_not_given_changes_nothing(shell, stage):
+    """Or --config could never set its value."""
     for name in MODULES:
-        for parameter in dict(commands())[name].params:
-            switch = parameter.name in (
-                "as_json",
-                "quiet",
-                "dry_run",
-                "debug",
-                "remeasure",
-                "verify",
-                "figure",
-            )
-            assert parameter.default is (False if switch else None), f"{name} {parameter.name}"
+        assert shell(name).code == 0 and stage.settings == load_settings()
+        switches = {key: value for key, value in stage.options.items() if value is not None}
+        assert not any(switches.values()), switches
+
+
+@pytest.mark.parametrize(
+    ("arguments", "defaults"),
+    [
+        ("collect --help", ("trajectories. [default: 200]", "[default: desktop]")),
+        ("collect --help --preset smoke", ("trajectories. [default: 24]", "8]")),
+        ("collect --plant gym --help", ("trajectories. [default: 200]", "[default: gym]")),
+        ("train-encoder --help", ("[default: gate]", "encoder. [default: 1200]")),
+        ("train-encoder --preset=smoke --help", ("[default: no-gate]", "encoder. [default: 6]")),
+        ("scale --help", ("cell. [default: 20]", "round-robin, max-aoi, innovation]")),
+        ("view --help", ("[default: hjepa,hold]", "[default: 0.05]")),
+    ],
+)
+def test_help_shows_the_defaults_of_the_preset_in_force(shell, monkeypatch, arguments, defaults):
+    monkeypatch.setenv("COLUMNS", "200")
+    outcome = shell(*arguments.split())
+    assert outcome.code == 0
+    for default in defaults:
+        assert default in outcome.out
+
+
+@pytest.mark.parametrize("command", [*MODULES, "config show"])
+def test_help_leaves_the_program_as_it_was(shell, command):
+    before = shell(*command.split(), "--help").out
+    shell(*command.split(), "--help", "--preset", "smoke")
+    assert shell(*command.split(), "--help").out == before
 
 
 @pytest.mark.parametrize("arguments", [[], ["models"], ["data"], ["config"]])

@@ -30,7 +30,8 @@ def uninstall(monkeypatch, package):
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    for name in ("animation", "figures", "gym", "live", "pictures"):
+    drawing = ("animation", "figures", "live", "pictures")
+    for name in ("gym", *(f"output.{name}" for name in drawing)):
         monkeypatch.delitem(sys.modules, f"hjepa_cli.{name}", raising=False)
         monkeypatch.delattr(f"hjepa_cli.{name}", raising=False)
 

@@ -12,7 +12,7 @@ import pytest
 
 from hjepa_cli.core.datasets import dataset as datasets
 from hjepa_cli.core.evaluation import curves
-from hjepa_cli.errors import DataError
+from hjepa_cli.errors import DataError, Unsealed
 from hjepa_cli.storage import checkpoints, runs
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -50,14 +50,27 @@ def test_dataset_1() -> None:
 def test_curves_1() -> None:
     path = FIXTURES / "curves-1.json"
     digest = curves.Digest(**json.loads(path.read_text())["digest"])
-    entry = curves.read(path, digest)["hjepa"]
+    with pytest.warns(Unsealed, match="has no seal"):
+        assert curves.read(path, digest) == {}  # no cache
+    entry = curves.read(path, digest, named=True)["hjepa"]
     assert entry["tolerance_gap_steps"] == 12.5
+
+
+def test_curves_2() -> None:
+    path = FIXTURES / "curves-2.json"
+    digest = curves.Digest(**json.loads(path.read_text())["digest"])
+    assert curves.read(path, digest)["hjepa"]["tolerance_gap_steps"] == 12.5
 
 
 def test_run_1_had_no_inputs() -> None:
     found = runs.read_environment(FIXTURES / "run-1")
     assert found["schema"] == 1 and found["inputs"] == {}
     assert (found["stage"], found["preset"]) == ("train-encoder", "smoke")
+
+
+def test_run_2_had_no_settings() -> None:
+    found = runs.read_environment(FIXTURES / "run-2")
+    assert found["schema"] == 2 and found["inputs"]["dataset"]["path"] == "/data/desktop-0001"
 
 
 def test_newer_files_are_refused_with_what_to_do(tmp_path: Path) -> None:

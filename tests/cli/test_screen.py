@@ -1,16 +1,13 @@
 """What reaches the user: streams, tables at 80 and 120 columns, progress, JSON without NaN."""
 
 import io
-import json
 import re
 import time
-from pathlib import Path
 
-import numpy as np
 import pytest
 
 from hjepa_cli.output import screen as screen_module
-from hjepa_cli.output.screen import Screen, layout, one_line, plain
+from hjepa_cli.output.screen import Screen, layout, one_line
 
 
 class Terminal(io.StringIO):
@@ -271,33 +268,3 @@ def test_forced_colours_do_not_turn_a_file_into_a_terminal(streams, monkeypatch)
         p.advance()
     screen.table("T", ["a"], [[1]])
     assert "\x1b" not in streams[0].getvalue() + streams[1].getvalue()
-
-
-def test_plain_turns_results_into_strict_json():
-    document = plain(
-        {
-            "path": Path("a") / "b",
-            "nan": float("nan"),
-            "inf": -float("inf"),
-            "numpy": np.float64("nan"),
-            "array": np.array([[1.0, np.inf], [2.0, 3.0]], dtype=np.float32),
-            "count": np.int64(3),
-            "flag": np.bool_(True),
-            1: (1, 2),
-        }
-    )
-    assert json.loads(json.dumps(document, allow_nan=False)) == {
-        "path": "a/b",
-        "nan": None,
-        "inf": None,
-        "numpy": None,
-        "array": [[1.0, None], [2.0, 3.0]],
-        "count": 3,
-        "flag": True,
-        "1": [1, 2],
-    }
-
-
-def test_plain_refuses_what_has_no_json_form():
-    with pytest.raises(TypeError, match="object has no JSON form"):
-        plain({"x": object()})

@@ -26,7 +26,9 @@ METHODS = {
 # Reviewed: public names come from a table in the same file; ffmpeg gets a list of arguments.
 ALLOWED = {
     "hjepa_cli/__init__.py": ("importlib.import_module",),
+    "hjepa_cli/cli/execution.py": ("importlib.import_module",),  # stages, by the list of commands
     "hjepa_cli/output/animation.py": ("subprocess.Popen",),
+    "hjepa_cli/stages/stage.py": ("importlib.import_module",),  # places in the package's own code
     # The package's own extensions by a table; a file that the user names on the command line.
     "hjepa_cli/plugins.py": ("importlib.import_module", "exec()", "compile()"),
 }
@@ -109,7 +111,7 @@ def test_the_guard_lets_models_be_evaluated() -> None:
 
 def test_dependencies_are_few_and_bounded() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert len(project["dependencies"]) <= 8
+    assert len(project["dependencies"]) <= 9
     for requirement in project["dependencies"]:
         assert ">=" in requirement and "<" in requirement.partition(">=")[2], requirement
 

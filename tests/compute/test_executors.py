@@ -308,14 +308,14 @@ class Told:
         if self.answer == {}:
             raise TimeoutError
 
-    def run(self, function: Any) -> dict[str, dict[str, str]]:
+    def run(self, function: Any, names: Any) -> dict[str, dict[str, str]]:
         if isinstance(self.answer, Exception):
             raise self.answer
         return self.answer
 
 
 def test_workers_must_be_there_and_compute_the_same() -> None:
-    here = executors.versions()
+    here = executors.versions(executors.NUMBERS_FROM)
     executors.check_cluster(Told({"tcp://a:1": here, "tcp://b:1": dict(here)}), "x")
     for answer, message in (
         ({}, "--cluster x: the scheduler has no workers"),
@@ -333,7 +333,7 @@ def test_a_scheduler_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 
     class Client(Told):
         def __init__(self, **_: Any) -> None:
-            super().__init__({"tcp://a:1": executors.versions()})
+            super().__init__({"tcp://a:1": executors.versions(executors.NUMBERS_FROM)})
             self.status = "running"
 
         def nthreads(self) -> dict[str, int]:
@@ -362,5 +362,6 @@ def test_a_scheduler_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 def test_hints_to_repeat_name_the_command_that_goes_on() -> None:
     """The same command without --out would begin again elsewhere."""
     with pytest.raises(NumericalError) as caught, collect.telling_how_to_go_on(Path("data")):
-        raise executors._worker_died()
+        with executors.broken_pool_reported():
+            raise executors.BrokenProcessPool
     assert caught.value.hint == "free some memory, then hjepa resume data"

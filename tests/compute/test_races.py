@@ -18,7 +18,7 @@ from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.evaluation import workers
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, silent
-from hjepa_cli.errors import NumericalError, StorageError
+from hjepa_cli.errors import LockedError, NumericalError, StorageError
 from hjepa_cli.storage import files
 from hjepa_cli.storage.runs import Run
 
@@ -77,7 +77,7 @@ def test_a_refusal_says_who_is_working_there(tmp_path: Path) -> None:
     with start(code, tmp_path) as holder:
         assert holder.stdout is not None
         pid = int(holder.stdout.readline())
-        with pytest.raises(files.LockedError, match=rf"{tmp_path}: process {pid} on [\w.-]+$"):
+        with pytest.raises(LockedError, match=rf"{tmp_path}: process {pid} on [\w.-]+$"):
             files.lock_directory(tmp_path)
         assert (tmp_path / files.LOCK_FILE).stat().st_size  # the refused one wiped nothing out
         holder.kill()
@@ -92,7 +92,7 @@ def test_a_refusal_says_who_is_working_there(tmp_path: Path) -> None:
 def test_what_stands_in_a_foreign_lock_is_not_repeated(tmp_path: Path, text: str) -> None:
     with files.lock_directory(tmp_path):
         (tmp_path / files.LOCK_FILE).write_text(text)
-        with pytest.raises(files.LockedError, match=rf"working in {tmp_path}$"):
+        with pytest.raises(LockedError, match=rf"working in {tmp_path}$"):
             files.lock_directory(tmp_path)
 
 
@@ -229,3 +229,49 @@ def test_ctrl_c_leaves_no_process_behind_and_the_command_goes_on(
     assert 2 <= done < 61
     kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "data").glob("shard-*")}
     assert len(kept) >= done
+
+
+@pytest.mark.parametrize("where", ["pool", "workers", "local"])
+def test_children_import_nothing_from_the_current_directory(where: str, tmp_path: Path) -> None:
+    """With a look-alike of every module that they could find there."""
+    if where == "local":
+        pytest.importorskip("distributed")
+    here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    here.mkdir(), elsewhere.mkdir()
+    look_alike = f"open({str(tmp_path / 'executed')!r}, 'a').write(__name__ + ' ')\n"
+    for name in (*sys.stdlib_module_names, "numpy", "torch", "hjepa_cli", "distributed", "dask"):
+        (here / f"{name}.py").write_text(look_alike)
+    launcher = elsewhere / "launcher.py"  # as the command hjepa lies elsewhere
+    launcher.write_text(
+        textwrap.dedent(f"""
+        import operator
+        from hjepa_cli.compute.executors import finished, open_executor, placed
+        if {where!r} == "workers":
+            from hjepa_cli.core.evaluation.workers import open_workers
+            with placed(1), open_workers(0):
+                pass  # its counter has a lock, which starts a process
+        else:
+            with (
+                placed(1, "local" if {where!r} == "local" else None),
+                open_executor(1) as (executor, count),
+            ):
+                assert sorted(finished(executor, count, operator.neg, [1, 2])) == [-2, -1]
+        """)
+    )
+    ended = subprocess.run(
+        [sys.executable, str(launcher)], cwd=here, env=ENVIRONMENT, capture_output=True, text=True
+    )
+    executed = tmp_path / "executed"
+    assert not executed.exists(), executed.read_text()
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_the_environment_of_the_caller_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    for before in (None, "", "yes"):
+        if before is None:
+            monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+        else:
+            monkeypatch.setenv("PYTHONSAFEPATH", before)
+        with executors.spawning():
+            assert os.environ["PYTHONSAFEPATH"] == "1"
+        assert os.environ.get("PYTHONSAFEPATH") == before

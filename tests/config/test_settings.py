@@ -9,38 +9,40 @@ from typing import Any
 
 import pytest
 
-from hjepa_cli.config.settings import PRESETS, Settings, load_settings, origins
+from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.schema import PAPER_PROTOCOL, Settings, declared, dotted
+from hjepa_cli.config.settings import PRESETS, load_settings, origins
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
+from hjepa_cli.stages.train_encoder import ARCHITECTURE
+from hjepa_cli.storage.runs import to_toml
 
 
 def preset_file(name: str) -> dict[str, Any]:
-    text = (resources.files("hjepa_cli") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+    text = (resources.files("hjepa_cli.config") / f"presets/{name}.toml").read_text("utf-8")
     return tomllib.loads(text)
-
-
-def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in values.items():
-        path = prefix + key
-        found |= flat(value, f"{path}.") if isinstance(value, dict) else {path: value}
-    return found
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_loads_and_says_what_it_is(preset: str) -> None:
     settings = load_settings(preset)
     assert settings.preset == preset
-    changes = flat(preset_file(preset))
-    merged = flat(preset_file("default")) | changes
-    paper = {key: merged.pop(key) for key in list(merged) if key.startswith("protocol.paper.")}
-    expected = {key: value for key, value in merged.items() if value != []}
-    found = flat(settings.as_dict())
-    assert found.pop("preset") == preset
-    assert found == expected
+    changes = {} if preset == "default" else dotted(preset_file(preset))
+    paper = {key: changes.pop(key) for key in list(changes) if key.startswith("protocol.paper.")}
+    expected = dotted(Settings().as_dict()) | changes | {"preset": preset}
+    assert dotted(settings.as_dict()) == expected
     # The paper's protocol sets its own values over the preset's, and no others.
-    found = flat(load_settings(preset, flags={"protocol": "paper"}).as_dict())
+    expected |= {f"protocol.{key}": value for key, value in PAPER_PROTOCOL.items()}
     expected |= {key.replace(".paper.", "."): value for key, value in paper.items()}
-    assert found == expected | {"preset": preset}
+    assert dotted(load_settings(preset, flags={"protocol": "paper"}).as_dict()) == expected
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_settings_come_back_from_the_file_that_is_written_of_them(
+    preset: str, tmp_path: Path
+) -> None:
+    settings = load_settings(preset, flags={"seed": 7, "protocol": "paper"})
+    (tmp_path / "c.toml").write_text(to_toml(settings.as_dict()))
+    assert load_settings(preset, tmp_path / "c.toml") == settings
 
 
 def test_a_protocol_lies_between_preset_and_file(tmp_path: Path) -> None:
@@ -55,41 +57,17 @@ def test_a_protocol_lies_between_preset_and_file(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="choose one of steady, paper"):
         load_settings(flags={"protocol": "papers"})
     config.write_text("[protocol.paper]\nsteps = 500\n")
-    with pytest.raises(UsageError, match="unknown setting 'paper'"):
+    with pytest.raises(UsageError, match=r"unknown setting .protocol\.paper."):
         load_settings(config=config)
 
 
-def test_every_shipped_preset_is_listed() -> None:
-    folder = resources.files("hjepa_cli") / "presets"
-    names = {Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".toml")}
-    assert names == set(PRESETS)
-
-
 def test_the_defaults_are_those_of_the_papers() -> None:
-    """Values that spec and paper state; a typo in default.toml would move every result."""
+    """Values that the papers state: those of TS-JEPA's simulation and of the hierarchy."""
     settings = load_settings()
-    assert (settings.plant, settings.encoder.h, settings.encoder.embedding) == ("desktop", 4, 256)
-    assert dataclasses.astuple(settings.hierarchy)[:3] == (4, 2, 1)
-    assert settings.encoder.ema_decay == 0.99 and settings.encoder.rollout_steps == 80
-    collect = settings.collect
-    assert (collect.trajectories, collect.test_trajectories, collect.clean_trajectories) == (
-        200,
-        40,
-        40,
-    )
-    assert (collect.x_m, collect.x_dot_m_s, collect.theta_rad, collect.theta_dot_rad_s) == (
-        0.1,
-        0.5,
-        0.35,
-        5.0,
-    )
-    protocol = settings.protocol
-    assert protocol.gaps == (1, 20, 40, 80, 120, 160, 240, 320)
-    assert (protocol.warmup_steps, protocol.steps) == (1000, 3000)
-    paper = load_settings(flags={"protocol": "paper"}).protocol
-    assert (paper.warmup_steps, paper.steps, paper.bracket_devices) == (0, 1000, 256)
-    assert protocol.acceptable_score == 0.62 and protocol.acceptable_lq_ratio == 0.5
-    assert settings.radio.bandwidth_hz == 20e6 and settings.radio.snr_db == "10:30"
+    assert (settings.encoder.h, settings.hierarchy.m, settings.hierarchy.l) == (4, 2, 1)
+    assert settings.encoder.ema_decay == 0.99 and settings.radio.bandwidth_hz == 20e6
+    protocol = load_settings(flags={"protocol": "paper"}).protocol
+    assert (protocol.warmup_steps, protocol.steps, protocol.bracket_devices) == (0, 1000, 256)
     paper = load_settings("paper")
     assert paper.encoder.learning_rate == 9e-3 and paper.encoder.rollout_steps == 15
 
@@ -108,30 +86,36 @@ def test_precedence(tmp_path: Path) -> None:
 
 
 def test_loading_twice_is_independent() -> None:
-    load_settings("paper", flags={"collect.steps": 1})
-    assert load_settings() == load_settings(None) == load_settings("default")
+    load_settings("paper", flags={"collect.steps": 7})
+    assert load_settings() == load_settings(None) == load_settings("default") == Settings()
     assert load_settings().collect.steps == 100
 
 
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("sead = 1", r"unknown setting 'sead' in .*c\.toml; did you mean 'seed'"),
+        ("sead = 1", r"unknown setting 'sead' in .*c\.toml, line 1; did you mean 'seed'"),
         ("qqq = 1", "unknown setting 'qqq'.*valid keys: plant, seed"),
-        ("[colect]\nsteps = 1", "unknown setting 'colect'.*did you mean 'collect'"),
-        ("[collect]\nstep = 1", r"'step'.*section \[collect\]; did you mean 'steps'"),
-        ("collect = 1", "'collect' in .* is a section, not a value"),
+        ("seed = 1\n[colect]\nsteps = 1", "'colect' in .*, line 2; did you mean 'collect'"),
+        ("[collect]\n\nstep = 1", "'collect.step' in .*, line 3; did you mean 'collect.steps'"),
+        ("collect = 1", "'collect' in .*, line 1 is a section, not a value"),
+        ("[seed]\na = 1", "'seed' in .*, line 1 is a value, not a section"),
         ('preset = "paper"', "unknown setting 'preset'"),
-        ('plant = "moon"', "plant = 'moon'; choose one of desktop, gym"),
-        ("[collect]\nsteps = 1.5", r"collect\.steps = 1\.5; expected a whole number"),
-        ("[collect]\nsteps = true", r"collect\.steps = True; expected a whole number"),
-        ('[collect]\nsteps = "5"', r"collect\.steps = '5'; expected a whole number"),
-        ("[collect]\nx_m = nan", r"collect\.x_m = nan; expected a finite number"),
-        ("[collect]\nx_m = inf", "expected a finite number"),
-        ("[collect]\nx_m = true", "expected a number"),
-        ("[encoder]\ngate = 1", r"encoder\.gate = 1; expected true or false"),
+        ('plant = "moon"', "plant = 'moon' in .*, line 1; choose one of desktop, gym"),
+        ("[collect]\nsteps = 1.5", r"collect\.steps = 1\.5 in .*, line 2; expected a whole number"),
+        ("collect.steps = true", r"collect\.steps = True in .*, line 1; expected a whole number"),
+        ("collect = { steps = '5' }", r"collect\.steps = '5' in .*c\.toml; expected a whole"),
+        ("[collect]\nsteps = 1", r"collect\.steps = 1 in .*; expected .* of at least 2"),
+        ("[collect]\nx_m = nan", r"collect\.x_m = nan in .*; expected a finite number"),
+        ("[collect]\nx_m = inf", "expected a finite number of at least 0"),
+        ("[collect]\nx_m = true", "expected a finite number"),
+        ("[radio]\ncarrier_ghz = 0.1", "expected a finite number from 0.5 to 100"),
+        ("[actor]\ndropout = 1.0", "expected a finite number of at least 0 and less than 1"),
+        ("[encoder]\ngate = 1", r"encoder\.gate = 1 in .*; expected true or false"),
+        ('device = "tpu"', "device = 'tpu' in .*, line 1; choose one of auto, cpu, cuda"),
         ("[protocol]\ngaps = 3", "expected a list"),
-        ('[protocol]\ngaps = [1, "2"]', r"protocol\.gaps = '2'; expected a whole number"),
+        ('[protocol]\ngaps = [1, "2"]', r"protocol\.gaps\[1\] = '2' in .*, line 2; expected a who"),
+        ("[protocol]\nsteps = 1\n[protocol.noise]\na = 1", "'protocol.noise'.* line 3 is a value"),
     ],
 )
 def test_mistakes_in_a_config_are_named(tmp_path: Path, text: str, match: str) -> None:
@@ -139,6 +123,36 @@ def test_mistakes_in_a_config_are_named(tmp_path: Path, text: str, match: str) -
     with pytest.raises(UsageError, match=match) as caught:
         load_settings(config=tmp_path / "c.toml")
     assert "\n" not in caught.value.message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'methods = ["""\nseed = 1\n"""]\nseed = -1',  # a line within a text
+        "seed = -1\nmethods = [\nseed = 1\n]",  # no TOML, but two lines that look like it
+    ],
+)
+def test_a_line_that_is_not_certain_is_not_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "c.toml").write_text(text)
+    with pytest.raises((UsageError, DataError)) as caught:
+        load_settings(config=tmp_path / "c.toml")
+    assert "toml, line" not in caught.value.message
+
+
+def test_values_from_python_meet_the_same_bounds() -> None:
+    with pytest.raises(UsageError, match=r"^collect\.steps = 1; expected a whole number"):
+        load_settings(flags={"collect.steps": 1})
+    settings = load_settings()
+    for section, changes, message in (
+        ("protocol", {"steps": 0}, "protocol.steps = 0; expected a whole number"),
+        ("protocol", {"gaps": (1, 0)}, r"protocol.gaps\[1\] = 0; expected a whole number"),
+        ("radio", {"harq_rounds": 17}, "radio.harq_rounds = 17; expected .* from 1 to 16"),
+        ("encoder", {"mirror": "no"}, "encoder.mirror = 'no'; choose one of exact, augment, none"),
+        ("actor", {"dropout": float("nan")}, "actor.dropout = nan; expected a finite number"),
+    ):
+        changed = dataclasses.replace(getattr(settings, section), **changes)
+        with pytest.raises(UsageError, match=message):
+            check_settings(dataclasses.replace(settings, **{section: changed}))
 
 
 def test_whole_numbers_serve_as_floats(tmp_path: Path) -> None:
@@ -161,7 +175,7 @@ def test_config_files_that_are_none(tmp_path: Path) -> None:
 def test_unknown_preset_and_flag() -> None:
     with pytest.raises(UsageError, match="unknown preset 'papper'; choose one of default, gym"):
         load_settings("papper")
-    with pytest.raises(UsageError, match="unknown setting 'stepz' in flag"):
+    with pytest.raises(UsageError, match=r"unknown setting .collect\.stepz.; did you mean"):
         load_settings(flags={"collect.stepz": 3})
 
 
@@ -174,7 +188,10 @@ def test_settings_are_frozen_and_plain() -> None:
 
 
 def test_every_setting_is_read_somewhere() -> None:
-    """No dead options: each field is asked for as an attribute, or fits a getattr(f"…")."""
+    """No dead options: each field is asked for as an attribute, or fits a getattr(f"…").
+
+    An architecture's are read from the checkpoint that records them.
+    """
     package = Path(str(resources.files("hjepa_cli")))
     source = "\n".join(path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
     composed = re.findall(r'getattr\([\w.]+, f"([\w{}]+)"', source)
@@ -185,11 +202,8 @@ def test_every_setting_is_read_somewhere() -> None:
             re.fullmatch(pattern, name) for pattern in patterns
         )
 
-    sections = [field.type for field in dataclasses.fields(Settings)]
-    kinds = [Settings, *(kind for kind in sections if dataclasses.is_dataclass(kind))]
-    assert len(kinds) == 9
-    names = {field.name for kind in kinds for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    dead = sorted(name for name in names if not is_read(name))
+    names = {key.rpartition(".")[2] for key in declared()}
+    dead = sorted(name for name in names - set(ARCHITECTURE) if not is_read(name))
     assert not dead, f"settings that nobody reads: {dead}"
 
 

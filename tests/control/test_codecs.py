@@ -6,19 +6,21 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_payload import reference
+from test_integers import reference
 
-from hjepa_cli.config.checks import parse_payload
+from hjepa_cli.config.checks import check_payload
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.core.control.codecs import bits_of, build_codec, fit_pca
+from hjepa_cli.core.control.codecs.principal_components import fit_components
 from hjepa_cli.core.networks.encoder import normalise
 from hjepa_cli.errors import UsageError
+from hjepa_cli.plugins import CODECS
 
 
 class Seen:
     """A stand-in for a model: embeddings that are a smooth function of the pole's pixels."""
 
     plant_name, architecture = "desktop", {"embedding": 16}
+    frames, device = 2, "cpu"
 
     def __init__(self):
         self.mix = torch.from_numpy(np.random.default_rng(0).normal(size=(16, 16))).float()
@@ -43,12 +45,12 @@ SETTINGS = load_settings(flags={"collect.trajectories": 4, "collect.steps": 25})
     ],
 )
 def test_bits(name, bits):
-    assert bits_of(name, 256) == bits
+    assert CODECS[name].bits(256) == bits
 
 
 def test_floats_and_integers():
     z = normalise(torch.from_numpy(np.random.default_rng(0).normal(size=(50, 16))).float())
-    seen = {name: build_codec(name, Seen(), SETTINGS) for name in ("float32", "float16", "int4")}
+    seen = {name: CODECS[name].fit(Seen(), SETTINGS) for name in ("float32", "float16", "int4")}
     assert torch.equal(seen["float32"].send(z), z)
     assert torch.equal(seen["float16"].send(z), z.half().float())
     assert seen["int4"].send(z).numpy() == pytest.approx(reference(z.numpy(), 4), abs=1e-5)
@@ -64,7 +66,7 @@ def correlated(count, seed=0):
 
 def test_components_are_those_of_the_singular_value_decomposition():
     z = correlated(500)
-    codec = fit_pca(z, 5, 16)
+    codec = fit_components(z, 5, 16)
     _, _, rows = np.linalg.svd(z.double().numpy() - z.double().numpy().mean(0))
     overlap = np.abs(codec.components.double().numpy() @ rows[:5].T)
     assert overlap == pytest.approx(np.eye(5), abs=1e-4)
@@ -78,7 +80,7 @@ def test_components_are_those_of_the_singular_value_decomposition():
 @pytest.mark.parametrize("bits", [1, 4, 8])
 def test_codes_fit_their_bits_and_steps_bound_the_error(bits):
     z, other = correlated(500), correlated(200, seed=1)
-    codec = fit_pca(z, 3, bits)
+    codec = fit_components(z, 3, bits)
     codes = codec.encode(torch.cat([z, 100 * other]))
     assert codes.min() >= 0 and codes.max() < 2**bits and codes.dtype == torch.int32
     coefficients = (z - codec.mean) @ codec.components.T
@@ -92,20 +94,20 @@ def test_codes_fit_their_bits_and_steps_bound_the_error(bits):
 def test_more_bits_and_components_lose_less():
     z = correlated(1000)
     loss = {
-        (n, b): float((fit_pca(z, n, b).send(z) - z).square().mean())
+        (n, b): float((fit_components(z, n, b).send(z) - z).square().mean())
         for n, b in ((2, 8), (6, 8), (6, 4))
     }
     assert loss[6, 8] < loss[2, 8] and loss[6, 8] < loss[6, 4]
 
 
 def test_components_are_fitted_to_the_seed_s_trajectories_and_nothing_else():
-    first, second = (build_codec("pca-4x6", Seen(), SETTINGS) for _ in range(2))
+    first, second = (CODECS["pca-4x6"].fit(Seen(), SETTINGS) for _ in range(2))
     assert torch.equal(first.components, second.components)
     assert torch.equal(first.reach, second.reach)
-    other = build_codec("pca-4x6", Seen(), dataclasses.replace(SETTINGS, seed=1))
+    other = CODECS["pca-4x6"].fit(Seen(), dataclasses.replace(SETTINGS, seed=1))
     assert not torch.equal(first.reach, other.reach)
     with pytest.raises(UsageError, match="16 values"):
-        build_codec("pca-17x6", Seen(), SETTINGS)
+        CODECS["pca-17x6"].fit(Seen(), SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -114,4 +116,4 @@ def test_components_are_fitted_to_the_seed_s_trajectories_and_nothing_else():
 )
 def test_unknown_payloads_name_the_choices(name):
     with pytest.raises(UsageError, match="pca-8x6"):
-        parse_payload(name)
+        check_payload(name)

@@ -13,15 +13,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hjepa_cli.config.checks import ANCHORS, TRUE_STATE
+from hjepa_cli.config.checks import without_model
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import LastForce, Oracle, StrideController
+from hjepa_cli.core.control.drivers import build_driver, methods_of
 from hjepa_cli.core.control.loop import Controller, Draws, every_step, gap_schedule, simulate
-from hjepa_cli.core.control.methods import build_method, true_state_method
+from hjepa_cli.core.control.methods.true_state import true_state_driver
 from hjepa_cli.core.networks.model import Model, build_modules
-from hjepa_cli.core.plants.cartpole.dynamics import rk4_step
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 from hjepa_cli.core.plants.named import CartPole, plant, teacher
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.train_encoder import describe_architecture
 
 DESKTOP = plant("desktop")
@@ -123,7 +124,7 @@ def test_the_oracle_predicts_an_undisturbed_plant() -> None:
         noise_theta_dot_rad_s=0.0,
     )
     draws = Draws.make(quiet, 5, seed=0)
-    method = true_state_method("oracle", DESKTOP, 0)
+    method = true_state_driver("oracle", DESKTOP, 0)
     once = gap_schedule(300, 300, 5)
     once[1:] = False
     costs = [
@@ -149,9 +150,7 @@ def test_the_oracle_advances_only_its_own_estimate() -> None:
 
 
 def test_a_lost_oracle_stays_finite() -> None:
-    oracle = Oracle(
-        lambda states: states[:, 0], lambda s, u: rk4_step(DESKTOP, s, u, 1e-3), 20.0, 1
-    )
+    oracle = Oracle(lambda states: states[:, 0], DESKTOP.advance, 20.0, 1)
     oracle.act(np.array([True]), np.array([[50.0, 50.0, 3.0, 50.0]]))
     for _ in range(2000):
         assert np.isfinite(oracle.act(np.array([False]), None)).all()
@@ -179,7 +178,7 @@ def reachable(root: object) -> list[object]:
 
 def controllers() -> dict[str, Controller]:
     built: dict[str, Controller] = {
-        name: true_state_method(name, DESKTOP, 0).controller(2) for name in TRUE_STATE
+        name: true_state_driver(name, DESKTOP, 0).controller(2) for name in without_model()
     }
     return built | {"stride": StrideController(Linear(4), 2)}
 
@@ -203,8 +202,8 @@ def embedding_controllers() -> dict[str, Controller]:
     model = untrained_model()
     few = {"collect.trajectories": 2, "collect.test_trajectories": 2, "collect.steps": 8}
     settings = load_settings(flags=few)
-    built = {name: build_method(name, settings, model).controller(2) for name in model.methods}
-    assert set(ANCHORS) < built.keys()
+    built = {name: build_driver(name, settings, model).controller(2) for name in methods_of(model)}
+    assert {name for name in METHODS if METHODS[name].fitted} < built.keys()
     return built
 
 
@@ -221,7 +220,7 @@ def test_no_controller_holds_a_plant(build: Callable[[], dict[str, Controller]])
         assert [item for item in reachable(smuggled) if isinstance(item, forbidden)], name
 
 
-@pytest.mark.parametrize("name", [*TRUE_STATE, "stride"])
+@pytest.mark.parametrize("name", [*without_model(), "stride"])
 def test_forces_follow_from_packets_alone(name: str) -> None:
     """Gusts after the only packet change the plant and not one force."""
     options = dataclasses.replace(load_settings(flags={"protocol": "paper"}).protocol, steps=40)
@@ -254,7 +253,7 @@ def sensor_of(name: str) -> Any:
 
 
 def test_teacher_is_the_optimal_method() -> None:
-    method = true_state_method("optimal", DESKTOP, 2064)
+    method = true_state_driver("optimal", DESKTOP, 2064)
     states = np.random.default_rng(0).normal(size=(5, 4)) * 0.1
     forces = method.controller(5).act(np.ones(5, dtype=bool), states)
     assert forces == pytest.approx(teacher("desktop")(states))

@@ -5,11 +5,12 @@ import pytest
 import torch
 from test_controllers import untrained_model
 
-from hjepa_cli.core.control.codecs import Integers
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.disagreement import TwoLevels, calibrate_levels
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.error_growth import conformal_growth
-from hjepa_cli.core.control.methods import embedding_method
+from hjepa_cli.core.control.planners import OnePredictor
 from hjepa_cli.core.radio.uplink import Access, Uplink
 
 AGES = (4, 20, 80)
@@ -38,7 +39,7 @@ def test_levels_part_with_every_stride_and_meet_at_a_packet():
         arrives = everybody if k == 0 else second & (k == 4)
         packets = torch.zeros(int(arrives.sum()), 1) if arrives.any() else None
         assert np.array_equal(both.act(arrives, packets), alone.act(arrives, packets))
-        assert np.array_equal(both.outlook(), alone.outlook())
+        assert np.array_equal(both.planned_n(), alone.planned_n())
         apart.append(both.apart * 40)
     # Half a newton a step, known at the end of each stride; device 1 starts anew at k = 4.
     assert np.transpose(apart) == pytest.approx(
@@ -61,7 +62,7 @@ def test_the_slope_is_found_and_new_devices_stay_below_nine_times_in_ten(slope):
     assert levels.exponent == pytest.approx(slope, abs=0.03)
     errors, apart = devices(4000, slope, 2)
     for place, age in enumerate(AGES):
-        bound = levels.growth.at(age) * levels.doubt(np.full(4000, age), apart[:, place])
+        bound = levels.growth.at(age) * levels.relative_growth(np.full(4000, age), apart[:, place])
         inside = errors[:, place] ** 2 <= bound
         assert inside.mean() == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 1000))
         # Not only on average: in the half where the levels are far apart, too.
@@ -84,7 +85,9 @@ def test_levels_that_know_nothing_leave_the_growth_table():
     assert levels.growth.at(AGES) == pytest.approx(
         conformal_growth(AGES, errors[39:]).at(AGES), rel=0.5
     )
-    assert levels.doubt(20, np.array([0.0])) > 0  # levels that agree fully: floored, not 0
+    assert (
+        levels.relative_growth(20, np.array([0.0])) > 0
+    )  # levels that agree fully: floored, not 0
 
 
 def test_the_uplink_serves_the_doubted_first():
@@ -106,14 +109,16 @@ def test_a_model_s_levels_are_the_hierarchy_and_its_one_step_predictor():
     for layer in model.networks.modules():
         if isinstance(layer, torch.nn.Linear):
             torch.nn.init.normal_(layer.weight, std=0.05)
-    method = embedding_method("hjepa", model, Integers(256, 8))
-    assert embedding_method("ts-jepa-1", model, Integers(256, 8)).two_levels is None
+    method = build_driver("hjepa", load_settings(), model)
+    assert build_driver("ts-jepa-1", load_settings(), model).two_levels is None
     both, alone = method.two_levels(3), method.controller(3)
     everybody, flat = np.ones(3, dtype=bool), torch.randn(3, 256)
     forces_n = [both.act(everybody, flat)]
     assert np.array_equal(forces_n[0], alone.act(everybody, flat))
     for k in range(1, 9):
-        flat = model.single_step(flat, torch.from_numpy(forces_n[-1]).float())
+        flat = OnePredictor(model, model.networks["flat"], 1).step(
+            flat, torch.from_numpy(forces_n[-1]).float()
+        )
         if k % model.strides.h == 0:
             reached = alone.reached[1]
             apart = (model.actor(reached) - model.actor(flat)).abs().numpy() / 40

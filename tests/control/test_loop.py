@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from played import play
 
-from hjepa_cli.config.settings import ProtocolSettings, load_settings
+from hjepa_cli.config.schema import ProtocolSettings
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import LastForce, Oracle
 from hjepa_cli.core.control.loop import (
     Draws,
@@ -20,10 +22,8 @@ from hjepa_cli.core.control.loop import (
     last_states,
     noise_per_step,
     packets_per_step,
-    play,
     simulate,
 )
-from hjepa_cli.core.plants.cartpole.dynamics import rk4_step
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 from hjepa_cli.core.plants.named import plant, teacher
 from hjepa_cli.errors import NumericalError, UsageError
@@ -309,7 +309,7 @@ def test_with_every_packet_hold_zero_and_oracle_are_the_optimal_controller() -> 
     controllers = [
         LastForce(act, 4, keep=True),
         LastForce(act, 4, keep=False),
-        Oracle(act, lambda s, u: rk4_step(DESKTOP, s, u, DESKTOP.step_s), 20.0, 4),
+        Oracle(act, DESKTOP.advance, 20.0, 4),
     ]
     outcomes = [simulate(DESKTOP, draws, always, c, true_state) for c in controllers]
     for device in range(4):

@@ -10,7 +10,6 @@ import pytest
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import load_dataset
 from hjepa_cli.core.datasets.trajectories import generate
-from hjepa_cli.core.plants.cartpole.dynamics import rk4_step
 from hjepa_cli.core.plants.named import Camera, plant, teacher
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
@@ -37,9 +36,9 @@ def test_each_state_follows_from_the_one_before_and_the_force_applied_there(pres
     kind, data = plant(settings.plant), generate(settings, "train")
     states = data.states.astype(float)
     forces_n = np.concatenate([np.zeros((6, 1)), data.applied_n[:, :-1]], axis=1)
-    exact = states[:, :-1]
+    exact, quarter = states[:, :-1], dataclasses.replace(kind, step_s=kind.step_s / 4)
     for _ in range(4):
-        exact = rk4_step(kind, exact, forces_n, kind.step_s / 4)
+        exact = quarter.advance(exact, forces_n)
     assert np.abs(exact - states[:, 1:]).max() < 1e-4
     assert states.shape == (6, 101, 4) and data.applied_n.shape == (6, 100)
 
@@ -169,9 +168,9 @@ def test_the_training_phase_s_uplink_is_told(tmp_path):
 @pytest.mark.parametrize(
     ("change", "name"),
     [
-        ({"trajectories": 0}, "--trajectories"),
-        ({"test_trajectories": -1}, "--test-trajectories"),
-        ({"steps": 0}, "--steps"),
+        ({"trajectories": 0}, "collect.trajectories"),
+        ({"test_trajectories": -1}, "collect.test_trajectories"),
+        ({"steps": 0}, "collect.steps"),
         ({"clean_trajectories": 0}, "clean_trajectories"),
         ({"exploration_hold_steps": 0}, "exploration_hold_steps"),
         ({"theta_rad": -0.1}, "theta_rad"),

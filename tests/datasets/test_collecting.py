@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from hjepa_cli.compute.executors import placed
-from hjepa_cli.config.settings import Settings, load_settings
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets import dataset as datasets
 from hjepa_cli.errors import (
     DataError,
@@ -22,11 +23,12 @@ from hjepa_cli.errors import (
     Interrupted,
     NumericalError,
     StorageError,
+    Unsealed,
     UsageError,
 )
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import collect, resume
-from hjepa_cli.storage import files, shards
+from hjepa_cli.storage import files, seals, shards
 from hjepa_cli.storage.shards import LOG, ShardLog
 
 SCREEN = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
@@ -166,6 +168,8 @@ def interrupted_collection(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def rewrite_task(task: dict[str, Any]) -> None:
+    """Replace the first line of the log by another, its seal right if it has one."""
+    task = seals.sealed(task) if seals.SEAL in task else task
     _, *lines = Path("data", LOG).read_text().split("\n")
     Path("data", LOG).write_text("\n".join([json.dumps(task), *lines]))
 
@@ -174,9 +178,10 @@ def test_a_collection_of_an_older_version_goes_on(monkeypatch: pytest.MonkeyPatc
     """One that had no schema yet, and not all of our settings."""
     task = interrupted_collection(monkeypatch)
     assert task.pop("schema") == shards.SCHEMA
-    del task["radio"], task["collect"]["exploration_n"]
+    del task["radio"], task["collect"]["exploration_n"], task[seals.SEAL]
     rewrite_task(task)
-    resume.run(Path("data"), SCREEN)
+    with pytest.warns(Unsealed, match="has no seal"):
+        resume.run(Path("data"), SCREEN)
     collect.run(small(), SCREEN, out=Path("whole"))
     assert contents(Path("data")) == contents(Path("whole"))
 
@@ -184,7 +189,7 @@ def test_a_collection_of_an_older_version_goes_on(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("change", "match", "hint"),
     [
-        ({"schema": 2}, "has schema 2; this hjepa reads up to 1", "--upgrade"),
+        ({"schema": 3}, "has schema 3; this hjepa reads up to 2", "--upgrade"),
         ({"schema": "1"}, "has schema '1'", None),
         ({"strange": 1}, "unknown setting 'strange'", "delete data"),
         ({"collect": {"trajectories": "x"}}, "collect.trajectories = 'x'", "delete data"),

@@ -121,6 +121,37 @@ def test_export_has_the_columns_of_stable_worldmodel(shell, name):
     assert about["plant"] == "desktop" and about["split"] == "train"
 
 
+def test_hdf5_is_of_a_layout_that_all_libraries_read_and_append_to(shell):
+    """HDF5 1.10 reads what its version 1.10 wrote; stable-worldmodel resizes every dataset."""
+    before, _ = exported(shell, "a.h5")
+    h5py = pytest.importorskip("h5py")
+    with h5py.File("a.h5", "r+", libver=("v110", "v110")) as file:
+        assert file.libver == ("v110", "v110")
+        for name, dataset in file.items():
+            assert dataset.chunks and dataset.maxshape[0] is None, name
+            assert dataset.id.get_create_plist().get_layout() == h5py.h5d.CHUNKED
+            rows = len(dataset)
+            dataset.resize(rows + 1, axis=0)
+            dataset[rows] = dataset[0]
+    with h5py.File("a.h5") as file:
+        for name, values in before.items():
+            assert (file[name][:-1] == values).all() and (file[name][-1] == values[0]).all()
+
+
+@pytest.mark.parametrize("kind", ["npz", "h5", "png"])
+def test_an_export_follows_links_and_refuses_pipes(shell, kind):
+    if kind == "h5":
+        pytest.importorskip("h5py")
+    command = ("data", "preview") if kind == "png" else ("data", "export")
+    Path(f"link.{kind}").symlink_to(f"real.{kind}")
+    assert shell(*command, "--out", f"link.{kind}").code == 0
+    assert Path(f"link.{kind}").is_symlink() and Path(f"real.{kind}").stat().st_size
+    os.mkfifo(f"pipe.{kind}")
+    outcome = shell(*command, "--out", f"pipe.{kind}", "--quiet")
+    assert_one_line_error(outcome, 74, f"pipe.{kind}: it is a pipe", "--out FILE")
+    assert Path(f"pipe.{kind}").is_fifo()
+
+
 def test_exported_rows_follow_the_plant(shell):
     """An action leads from its row to the next: replayed in the simulator, nothing else does."""
     arrays, about = exported(shell, "a.npz")

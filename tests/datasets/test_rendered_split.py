@@ -11,15 +11,15 @@ import torch
 from torch import Tensor, nn
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.core.control.codecs import Integers
+from hjepa_cli.core.control.codecs.integers import Integers
 from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.datasets.dataset import Trajectories
 from hjepa_cli.core.plants.named import Camera, plant
 from hjepa_cli.core.training.batches import FrameWindows
+from hjepa_cli.core.training.rendered import RenderedSplit, labels_of, standardisation_sample
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.inputs import CHUNK, RenderedSplit, embed, labels_of, render
-from hjepa_cli.stages.train_encoder import standardisation_sample
-from hjepa_cli.stages.train_hierarchy import embed_all
+from hjepa_cli.stages.embedding_training import embed_all
+from hjepa_cli.stages.inputs import CHUNK, embed, render
 
 QUIET = Screen(quiet=True)
 LIMIT_N = 20.0
@@ -233,7 +233,7 @@ def test_the_closed_loop_encodes_the_same_pairs(
             return torch.ones(len(frames), 4)
 
     spy = Spy()
-    sense = embedding_sensor(spy, Integers(4, 8))  # type: ignore[arg-type]
+    sense = embedding_sensor(spy, Integers(4, 8).send)  # type: ignore[arg-type]
     pairs = np.stack([recorded.states[:, :-1], recorded.states[:, 1:]], axis=2)
     sense(pairs.reshape(-1, 2, 4).astype(float))
     assert torch.equal(spy.shown, split.seen(1))

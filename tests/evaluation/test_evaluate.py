@@ -20,33 +20,35 @@ import torch
 
 from hjepa_cli import plugins
 from hjepa_cli.compute import executors
-from hjepa_cli.config.checks import TRUE_STATE
-from hjepa_cli.config.settings import Settings, load_settings
-from hjepa_cli.core.control.codecs import Integers
+from hjepa_cli.config.checks import without_model
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.codecs.integers import Integers
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.loop import Outcome
-from hjepa_cli.core.control.methods import build_method, embedding_method, true_state_method
-from hjepa_cli.core.control.payload import quantise
+from hjepa_cli.core.control.methods.true_state import true_state_driver
 from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation import simulator as simulator_module
 from hjepa_cli.core.evaluation import workers as workers_module
 from hjepa_cli.core.evaluation.bench import Bench, control_entry
-from hjepa_cli.core.evaluation.control_errors import control_errors, errors_at_every_step
+from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.evaluation.protocol import BESIDE, Point
 from hjepa_cli.core.evaluation.simulator import (
     BLOCK_LOOPS,
     Block,
+    Runner,
     Simulator,
     Tick,
-    run_points,
     silent,
+    start_points,
 )
 from hjepa_cli.core.evaluation.workers import ModelFile, ThisProcess, compute, open_workers
 from hjepa_cli.core.networks.model import Model, build_modules, tensors_of
 from hjepa_cli.core.plants.named import Camera, plant, teacher
 from hjepa_cli.errors import DataError, Interrupted, MissingInputError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import evaluate, resume, scale
+from hjepa_cli.stages import evaluate, measuring, resume, scale
 from hjepa_cli.stages.train_encoder import describe_architecture
 from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import save_checkpoint
@@ -54,6 +56,7 @@ from hjepa_cli.storage.runs import Run
 
 PIXELS = ("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero")
 DESKTOP = plant("desktop")
+TRUE_STATE = without_model()
 INT8 = Integers(256, 8)
 
 
@@ -235,16 +238,16 @@ def test_an_interrupted_run_continues_after_the_last_method(
     assert result["methods"] == whole["methods"]
 
 
-def subject_of(settings: Settings, checkpoint: Path | str | None = None) -> evaluate.Subject:
+def subject_of(settings: Settings, checkpoint: Path | str | None = None) -> evaluate.ModelSet:
     name = None if checkpoint is None else str(checkpoint)
-    return evaluate.open_subject(settings, Output().screen, name, None)
+    return evaluate.open_model_set(settings, Output().screen, name, None)
 
 
 def curves_in_a_run(settings: Settings, checkpoint: Path | str, **options: Any) -> dict[str, Any]:
     """As ``scale`` takes its curves."""
     output, subject = Output(), subject_of(settings, checkpoint)
     with Run.create("scale", None, settings.as_dict()) as record:
-        result = evaluate.curves_for(subject, output.screen, record, **options)
+        result = measuring.curves_for(subject, output.screen, record, **options)
     return result | {"text": output.text}
 
 
@@ -270,7 +273,10 @@ def test_without_runs_the_zoo_serves_and_its_curves_are_used(tmp_path: Path) -> 
     measured = evaluate.run(settings, Output().screen)
     assert measured["checkpoint"] == str(shipped)
     (shipped.parent / "curves.json").write_text(Path(measured["curves"]).read_text())
-    assert evaluate.cached(subject_of(settings), settings.methods).keys() == {"hold-true", "oracle"}
+    assert measuring.cached(subject_of(settings), settings.methods).keys() == {
+        "hold-true",
+        "oracle",
+    }
     again = evaluate.run(settings, Output().screen)
     assert again["methods"] == measured["methods"]
     assert "zoo/tiny/curves.json" in again["source"]  # nothing was measured again
@@ -374,15 +380,15 @@ def test_remeasure_replaces_damaged_curves_of_the_run_itself() -> None:
 
 
 def test_methods_are_built_in_one_thread_as_workers_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Anchors are fitted there."""
-    seen, build = [], simulator_module.build_method
+    """Closed forms are fitted there."""
+    seen, build = [], simulator_module.build_driver
 
     def watched(*given: Any) -> Any:
         seen.append(torch.get_num_threads())
         return build(*given)
 
     torch.set_num_threads(2)
-    monkeypatch.setattr(simulator_module, "build_method", watched)
+    monkeypatch.setattr(simulator_module, "build_driver", watched)
     evaluate.run(small(methods=("hold-true",)), Output().screen)
     assert seen == [1, 1] and torch.get_num_threads() == 2  # the teacher, too
 
@@ -395,13 +401,13 @@ def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:
     gaps = [point["d"] for point in entry["gap_bracket"]]
     probabilities = [point["p"] for point in entry["delivery_bracket"]]
     subject = subject_of(settings, checkpoint)
-    measured = evaluate.measure_points(
+    measured = measuring.measure_points(
         subject, Output().screen, method="zero-true", gaps=gaps, probabilities=probabilities
     )
     assert len(measured) == len(gaps) + len(probabilities) > 2
     assert measured == entry["gap_bracket"] + entry["delivery_bracket"]
     with pytest.raises(UsageError, match="no model for method 'ts-jepa-5'"):
-        evaluate.measure_points(subject, Output().screen, method="ts-jepa-5", gaps=[1])
+        measuring.measure_points(subject, Output().screen, method="ts-jepa-5", gaps=[1])
 
 
 @pytest.mark.parametrize("law", ["eval", "duty", "scheduled"])
@@ -462,7 +468,9 @@ def test_curves_of_another_digest_are_not_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("payload", ["int8", "pca-8x6"])
-def test_anchors_are_fitted_to_the_ranges_of_the_settings(tmp_path: Path, payload: str) -> None:
+def test_closed_forms_are_fitted_to_the_ranges_of_the_settings(
+    tmp_path: Path, payload: str
+) -> None:
     """Not to the dataset's, whose clean rollouts are used: both make a difference."""
     settings, path = small(payload=payload), tmp_path / "curves.json"
     collect = dataclasses.replace(settings.collect, theta_rad=2 * settings.collect.theta_rad)
@@ -523,7 +531,7 @@ def test_what_is_fitted_to_other_trajectories_is_measured_again(tmp_path: Path, 
 def test_late_packets_are_late_in_the_curves_too() -> None:
     settings = small()
     bench = Bench(settings.protocol, settings.seed, Simulator(settings, None))
-    prompt, late = (build_method(name, settings, None) for name in ("hold-true", "hold-true+9"))
+    prompt, late = (build_driver(name, settings, None) for name in ("hold-true", "hold-true+9"))
     found = {method.name: bench.curves(method).grid["gap"] for method in (prompt, late)}
     points, outcome = found["hold-true+9"]
     expected = bench.measure("hold-true+9", points, settings.protocol.curve_devices)
@@ -587,6 +595,12 @@ def test_damaged_curves_are_refused_beside_a_model_and_passed_over_elsewhere(
 # --- Blocks and workers -------------------------------------------------------------------------
 
 
+def simulated(
+    runner: Runner, method: str, points: Sequence[Point], devices: int, tick: Tick
+) -> Outcome:
+    return start_points(runner, method, points, devices, tick)()
+
+
 def test_blocks_cover_the_devices_and_follow_from_the_batch_alone() -> None:
     devices = BLOCK_LOOPS + 3
     settings = small(bracket_devices=devices, steps=2)
@@ -598,15 +612,15 @@ def test_blocks_cover_the_devices_and_follow_from_the_batch_alone() -> None:
 
     ticks: list[int] = []
     points = [Point("gap", 2.0), Point("delivery", 8.0)]
-    outcome = run_points(runner, "oracle", points, devices, ticks.append)
+    outcome = simulated(runner, "oracle", points, devices, ticks.append)
     cuts = [0, devices // 2, devices]
     assert [(block.start, block.stop) for block in asked] == list(pairwise(cuts))
     assert outcome.score.shape == outcome.cost.shape == (2, devices)
     assert sum(ticks) == 2 * devices * 2  # points, devices, steps
     asked.clear()
-    run_points(runner, "oracle", 20 * points[:1], 64, ticks.append)  # 1,280 loops
-    run_points(runner, "oracle", points, 64, ticks.append)
-    run_points(runner, "oracle", 3 * BLOCK_LOOPS * points[:1], 2, ticks.append)
+    simulated(runner, "oracle", 20 * points[:1], 64, ticks.append)  # 1,280 loops
+    simulated(runner, "oracle", points, 64, ticks.append)
+    simulated(runner, "oracle", 3 * BLOCK_LOOPS * points[:1], 2, ticks.append)
     cuts_of = [(block.start, block.stop) for block in asked]
     assert cuts_of == [(0, 32), (32, 64), (0, 64), (0, 1), (1, 2)]
 
@@ -616,7 +630,7 @@ def test_a_block_of_some_devices_equals_those_among_all() -> None:
     simulator = Simulator(settings, None)
     points = (Point("gap", 6.5), Point("delivery", 9.0))
     every, some = (
-        simulator.run(Block("hold-true", points, start, stop), lambda steps: None)
+        Block("hold-true", points, start, stop).compute(simulator, lambda steps: None)
         for start, stop in ((0, 12), (5, 8))
     )
     assert some.cost == pytest.approx(every.cost[:, 5:8], rel=1e-12)
@@ -632,14 +646,14 @@ def test_workers_do_what_one_process_does(checkpoint: Path) -> None:
         workers = opened.runner(settings, file)
         for name in ("oracle", "hjepa"):
             points = [Point("gap", 3.0)]
-            theirs = run_points(workers, name, points, 4, ticks.append)
-            ours = run_points(here, name, points, 4, silent)
+            theirs = simulated(workers, name, points, 4, ticks.append)
+            ours = simulated(here, name, points, 4, silent)
             assert np.array_equal(theirs.score, ours.score)
             assert np.array_equal(theirs.cost, ours.cost)
         with pytest.raises(UsageError, match="ts-jepa-5"):
-            run_points(workers, "ts-jepa-5", points, 4, ticks.append)
-        assert run_points(workers, "oracle", points, 4, ticks.append).cost == pytest.approx(
-            run_points(Simulator(settings, model), "oracle", points, 4, silent).cost
+            simulated(workers, "ts-jepa-5", points, 4, ticks.append)
+        assert simulated(workers, "oracle", points, 4, ticks.append).cost == pytest.approx(
+            simulated(Simulator(settings, model), "oracle", points, 4, silent).cost
         )
     assert sum(ticks) == 4 * 8 * 3  # devices, steps, runs that came to their end
 
@@ -661,13 +675,13 @@ def test_a_dead_worker_is_reported_and_none_is_left_behind() -> None:
     points = [Point("gap", 3.0)]
     with executors.placed(2), open_workers(0) as opened:
         workers = opened.runner(small(steps=8, bracket_devices=2 * BLOCK_LOOPS), None)
-        run_points(workers, "oracle", points, 2 * BLOCK_LOOPS, silent)
+        simulated(workers, "oracle", points, 2 * BLOCK_LOOPS, silent)
         processes = multiprocessing.active_children()
         assert len(processes) == 2
         for process in processes:
             process.kill()
         with pytest.raises(NumericalError, match="a worker process died"):
-            run_points(workers, "oracle", points, 64, silent)
+            simulated(workers, "oracle", points, 64, silent)
     assert not multiprocessing.active_children()
 
 
@@ -687,7 +701,7 @@ def test_an_interrupt_ends_the_workers_at_once() -> None:
 def test_workers_do_not_run_the_user_s_script_again() -> None:
     """A script without a guard, or one from standard input, may call us too."""
     before = dict(sys.modules["__main__"].__dict__)
-    with executors.anonymous_main():
+    with executors.spawning():
         sent = multiprocessing.spawn.get_preparation_data("worker")
     assert not [key for key in sent if key.startswith("init_main")]
     assert sys.modules["__main__"].__dict__ == before
@@ -773,7 +787,7 @@ def test_an_error_in_one_method_keeps_those_that_are_measured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """So does an interruption: what is in flight is lost, and measured when it is taken up."""
-    entry, keep, out = evaluate._Measured.entry, evaluate._Share.keep, Path("run")
+    entry, keep, out = measuring.MethodEntries.entry, measuring._Share.keep, Path("run")
     kept = threading.Event()
 
     def failing(self: Any, name: str) -> Any:
@@ -783,15 +797,15 @@ def test_an_error_in_one_method_keeps_those_that_are_measured(
         return entry(self, name)
 
     settings = small(methods=("oracle", "hold-true"))
-    monkeypatch.setattr(evaluate._Measured, "entry", failing)
-    monkeypatch.setattr(evaluate._Share, "keep", lambda *given: keep(*given) or kept.set())
+    monkeypatch.setattr(measuring.MethodEntries, "entry", failing)
+    monkeypatch.setattr(measuring._Share, "keep", lambda *given: keep(*given) or kept.set())
     with executors.placed(2), pytest.raises(NumericalError, match="the plant has gone"):
         evaluate.run(settings, Output().screen, out=out)
     assert not multiprocessing.active_children()
     assert list(json.loads((out / "curves.json").read_text())["methods"]) == ["hold-true"]
     seen: list[str] = []
     monkeypatch.setattr(
-        evaluate._Measured, "entry", lambda self, name: seen.append(name) or entry(self, name)
+        measuring.MethodEntries, "entry", lambda self, name: seen.append(name) or entry(self, name)
     )
     evaluate.run(settings, Output().screen, out=out)
     assert seen == ["oracle"]
@@ -803,10 +817,10 @@ def test_an_error_in_one_method_keeps_those_that_are_measured(
 def test_the_sensor_renders_encodes_and_quantises(checkpoint: Path) -> None:
     model = Model.load(checkpoint, "cpu")
     states = np.random.default_rng(0).normal(size=(2, 5, 4)) * 0.05
-    sense = embedding_sensor(model, INT8)
+    sense = embedding_sensor(model, INT8.send)
     camera = Camera(DESKTOP)
     frames = np.stack([camera.render(states[0]), camera.render(states[1])], axis=1)
-    expected = quantise(model.encode(frames), 8)
+    expected = INT8.send(model.encode(frames))
     assert torch.allclose(sense(np.stack([*states], axis=1)), expected, atol=1e-5)
     assert not torch.equal(expected, model.encode(frames))
     swapped = sense(np.stack([*states[::-1]], axis=1))
@@ -816,7 +830,7 @@ def test_the_sensor_renders_encodes_and_quantises(checkpoint: Path) -> None:
 def test_large_batches_are_encoded_like_small_ones(checkpoint: Path) -> None:
     model = Model.load(checkpoint, "cpu")
     states = np.random.default_rng(0).normal(size=(2, 300, 4)) * 0.05
-    sense = embedding_sensor(model, INT8)
+    sense = embedding_sensor(model, INT8.send)
     seen = np.stack([*states], axis=1)
     together = sense(seen)
     assert together.shape == (300, 256)
@@ -828,10 +842,10 @@ def test_embedding_methods_start_with_the_actor_s_force(checkpoint: Path) -> Non
     z = torch.randn(4, 256)
     expected = model.actor(z).detach().numpy()
     for name in PIXELS:
-        method = embedding_method(name, model, INT8)
+        method = build_driver(name, load_settings(), model)
         for controller in (method.controller(4), method.reactive(4)):
             assert controller.act(np.ones(4, dtype=bool), z) == pytest.approx(expected, abs=1e-3)
-    silent = embedding_method("zero", model, INT8).controller(4)
+    silent = build_driver("zero", load_settings(), model).controller(4)
     silent.act(np.ones(4, dtype=bool), z)
     assert silent.act(np.zeros(4, dtype=bool), None).tolist() == [0.0] * 4
 
@@ -845,11 +859,11 @@ def rollouts(steps: int) -> tuple[np.ndarray, np.ndarray]:
         settings,
         collect=dataclasses.replace(settings.collect, clean_trajectories=5, clean_steps=steps),
     )
-    subject = evaluate.Subject(settings, None, None, None)
+    subject = evaluate.ModelSet(settings, None, None, None)
     subject = dataclasses.replace(
         subject, settings=dataclasses.replace(settings, protocol=small().protocol)
     )
-    return evaluate._clean_rollouts(subject)
+    return measuring._clean_rollouts(subject)
 
 
 def test_control_errors_follow_their_definition() -> None:
@@ -857,7 +871,7 @@ def test_control_errors_follow_their_definition() -> None:
     act = teacher("desktop")
     first = act(states[:, 1])
     held, dropped = (
-        control_errors(true_state_method(name, DESKTOP, 0), states, teacher_n, 20.0, 30)
+        control_errors(true_state_driver(name, DESKTOP, 0), states, teacher_n, 20.0, 30)
         for name in ("hold-true", "zero-true")
     )
     for j in range(31):
@@ -868,12 +882,12 @@ def test_control_errors_follow_their_definition() -> None:
 
 def test_errors_at_every_step_are_those_of_the_last_packet() -> None:
     states, teacher_n = rollouts(40)
-    method = true_state_method("hold-true", DESKTOP, 0)
+    method = true_state_driver("hold-true", DESKTOP, 0)
     truth = teacher("desktop")(states[:, 1:32])
-    on_time = errors_at_every_step(method, states, teacher_n, 20.0, 30)
+    on_time = control_errors(method, states, teacher_n, 20.0, 30, every_packet=True)
     assert on_time == pytest.approx(np.abs(truth - teacher_n[:, :31]) / 40, abs=1e-9)
     late = dataclasses.replace(method, delay_steps=3)
-    errors = errors_at_every_step(late, states, teacher_n, 20.0, 30)
+    errors = control_errors(late, states, teacher_n, 20.0, 30, every_packet=True)
     assert errors[:, :3] == pytest.approx(np.abs(teacher_n[:, :3]) / 40, abs=1e-9)
     expected = np.abs(truth[:, :-3] - teacher_n[:, 3:31]) / 40
     assert errors[:, 3:] == pytest.approx(expected, abs=1e-9) and errors[:, 3:].max() > 1e-3
@@ -882,9 +896,9 @@ def test_errors_at_every_step_are_those_of_the_last_packet() -> None:
 def test_oracle_and_optimal_make_no_error_on_clean_rollouts() -> None:
     states, teacher_n = rollouts(120)
     for name, limit in (("optimal", 1e-6), ("oracle", 2e-3)):
-        method = true_state_method(name, DESKTOP, 0)
+        method = true_state_driver(name, DESKTOP, 0)
         assert control_errors(method, states, teacher_n, 20.0, 100).max() < limit
-    hold = true_state_method("hold-true", DESKTOP, 0)
+    hold = true_state_driver("hold-true", DESKTOP, 0)
     errors = control_errors(hold, states, teacher_n, 20.0, 100)
     entry = control_entry(errors, errors + 1, 100, seed=0)
     assert entry["nmae_every_step"] == pytest.approx(np.mean(entry["nmae"]) + 1)
@@ -927,7 +941,7 @@ def test_oracle_and_optimal_make_no_error_on_clean_rollouts() -> None:
 def test_ceilings_of_the_protocol(preset: str, expected: dict[str, Any]) -> None:
     settings = load_settings(preset, flags={"protocol": "paper"})
     bench = Bench(settings.protocol, settings.seed, Simulator(settings, None))
-    assert bench.teacher_score >= evaluate.MIN_TEACHER_SCORE
+    assert bench.teacher_score >= measuring.MIN_TEACHER_SCORE
     assert bench.teacher_score == pytest.approx(expected.pop("teacher"), abs=0.035)
     for name, ceiling in expected.items():
         points = [Point("gap", float(gap)) for gap in ceiling]

@@ -1,14 +1,15 @@
 """Numbers that must not move by accident. If one of these tests fails because you meant to change
-what the loop computes, raise ``LOOP_VERSION`` in core/control/loop.py, measure the zoo's curves again, and
-write down the new numbers here: cached curves of the old loop then expire."""
+what the loop computes, raise ``LOOP_VERSION`` in core/control/loop.py, measure the zoo's curves
+again, and write down the new numbers here: cached curves of the old loop then expire."""
 
 import numpy as np
 import pytest
 import torch
 
-from hjepa_cli.config.settings import Settings, load_settings
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.loop import LOOP_VERSION
-from hjepa_cli.core.control.methods import build_method
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.evaluation.protocol import Point
@@ -70,7 +71,9 @@ def untrained() -> Model:
 
 @pytest.mark.parametrize("name", OUTCOMES)
 def test_the_loop_on_true_states(name: str) -> None:
-    outcome = Simulator(settings(), None).run(Block(name, POINTS, 0, DEVICES), lambda steps: None)
+    outcome = Block(name, POINTS, 0, DEVICES).compute(
+        Simulator(settings(), None), lambda steps: None
+    )
     measured = np.concatenate([outcome.score.mean(axis=1), outcome.cost.mean(axis=1)])
     assert measured == pytest.approx(OUTCOMES[name], rel=1e-6)
     assert LOOP_VERSION == 5
@@ -82,7 +85,7 @@ def test_what_controllers_play_after_one_packet(name: str) -> None:
     options = settings()
     clean = generate(options, "clean")
     errors = control_errors(
-        build_method(name, options, untrained()),
+        build_driver(name, options, untrained()),
         clean.states[:6].astype(float),
         clean.teacher_n[:6].astype(float),
         plant("desktop").force_limit_n,

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hjepa_cli.config.settings import ProtocolSettings, load_settings
+from hjepa_cli.config.schema import ProtocolSettings
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.loop import Draws, Outcome, delivery_schedule, gap_schedule
 from hjepa_cli.core.evaluation.protocol import KINDS, Curves, Point, Reference, measure_curves
 

@@ -8,13 +8,13 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from test_cell import entry
+from test_device_counts import entry
 
 from hjepa_cli.config.checks import split_late
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import scale
+from hjepa_cli.stages import scale, scale_by_formula
 
 ENTRIES = {
     "hjepa": entry(gap=112.0, p=0.02),
@@ -51,8 +51,8 @@ def stage(tmp_path, monkeypatch):
         model = {"checkpoint": "model", "checkpoints": {}}
         return model | {"methods": found, "source": "curves of the test"}
 
-    monkeypatch.setattr(scale, "open_measurable", open_measurable)
-    monkeypatch.setattr(scale, "curves_for", curves_for)
+    monkeypatch.setattr(scale_by_formula, "open_measurable", open_measurable)
+    monkeypatch.setattr(scale_by_formula, "curves_for", curves_for)
 
     def call(
         snr="10:30", methods=tuple(ENTRIES), law="duty", config=None, quiet=False, **arguments
@@ -258,7 +258,7 @@ def blocks(stage, monkeypatch):
                 )
         return measured
 
-    monkeypatch.setattr(scale, "measure_points", measure_points)
+    monkeypatch.setattr(scale_by_formula, "measure_points", measure_points)
     blocks = SimpleNamespace(asked=asked, slope=0.3)
     return blocks
 

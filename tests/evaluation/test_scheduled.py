@@ -11,8 +11,8 @@ from command_line import assert_one_line_error, open_shell
 
 from hjepa_cli.compute.executors import placed
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.loop import Draws, every_step, gap_schedule, simulate
-from hjepa_cli.core.control.methods import build_method
 from hjepa_cli.core.evaluation import load_search as core_scheduled
 from hjepa_cli.core.evaluation import load_simulator
 from hjepa_cli.core.plants.named import plant
@@ -21,7 +21,8 @@ from hjepa_cli.core.radio.factory_hall import drop_devices
 from hjepa_cli.core.radio.uplink import report_bits
 from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import report, scale, scheduled, scheduled_cell
+from hjepa_cli.stages import block_loads, report, scale
+from hjepa_cli.stages.scale_by_simulation import BySimulation
 
 SMALL = {
     "protocol": "paper",
@@ -54,7 +55,7 @@ def test_round_robin_without_fading_agrees_with_duty(stage):
     load = row["load_per_block"]
     # Under duty a gap of D = load has the acceptable score: the same loops, other turns.
     settings = load_settings(flags=SMALL)
-    draws, method = Draws.make(settings.protocol, 150, 0), build_method("hold-true", settings, None)
+    draws, method = Draws.make(settings.protocol, 150, 0), build_driver("hold-true", settings, None)
     gap = gap_schedule(load, draws.steps, 150)
     scores = [
         simulate(plant("desktop"), draws, schedule[None], method.controller(150), method.sensor)
@@ -174,7 +175,7 @@ def test_one_step_is_refused_before_anything_is_written(stage, monkeypatch):
 
 
 def test_verify_simulates_both_sides_of_each_load(stage, monkeypatch):
-    monkeypatch.setattr(scheduled_cell, "VERIFY_AT", (0.7, 1.4))  # 150 steps fall off slowly
+    monkeypatch.setattr(block_loads, "VERIFY_AT", (0.7, 1.4))  # 150 steps fall off slowly
     result = stage("hold-true", schedulers=["round-robin"], seeds=2, verify=True, snr_db="10:20:10")
     (row, _), (inner, outer) = result["rows"], result["verify"]  # the load is that of every SNR
     assert (inner["expected"], outer["expected"]) == ("above", "below")
@@ -185,7 +186,7 @@ def test_verify_simulates_both_sides_of_each_load(stage, monkeypatch):
 
 
 def test_verify_goes_beyond_the_largest_load_of_a_search(stage, monkeypatch):
-    monkeypatch.setattr(scheduled_cell, "VERIFY_AT", (0.7, 1.4))
+    monkeypatch.setattr(block_loads, "VERIFY_AT", (0.7, 1.4))
     for name in ("BLOCK_DEVICES", "MAX_LOAD"):  # of the teacher beside them
         monkeypatch.setattr(load_simulator, name, 10)
     result = stage("hold-true", schedulers=["round-robin"], verify=True, seeds=2, snr_db="20")
@@ -193,7 +194,7 @@ def test_verify_goes_beyond_the_largest_load_of_a_search(stage, monkeypatch):
 
 
 def test_verify_fails_where_the_interval_decides_nothing(stage, monkeypatch):
-    monkeypatch.setattr(scheduled_cell, "VERIFY_AT", (0.95,))
+    monkeypatch.setattr(block_loads, "VERIFY_AT", (0.95,))
     with pytest.raises(NumericalError, match=r"hold-true, round-robin at 0\.95 x"):
         stage("hold-true", schedulers=["round-robin"], verify=True, snr_db="20")
 
@@ -214,7 +215,7 @@ def test_loads_of_two_seeds_are_compared_seed_by_seed(stage):
 def test_the_bytes_do_not_depend_on_how_many_work(tmp_path, monkeypatch):
     """The other seeds start from what the first one found, whoever is ready first."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(scheduled, "enforce", lambda *_: None)  # 120 steps verify nothing
+    monkeypatch.setattr(scale, "enforce", lambda result: None)  # 120 steps verify nothing
     flags = {
         "radio.law": "scheduled",
         "radio.schedulers": ["round-robin", "max-aoi"],
@@ -244,7 +245,10 @@ def test_gains_name_the_best_rivals():
         }.items()
         for s, n in zip(("round-robin", "innovation"), counts, strict=True)
     ]
-    found = {(gain["method"], gain["over"]): gain["ratio"] for gain in scheduled.gains(rows, 20.0)}
+    count = BySimulation(
+        load_settings(flags={"methods": ["oracle"]}), Screen(True, stdout=io.StringIO())
+    )
+    found = {(gain["method"], gain["over"]): gain["ratio"] for gain in count.gains(rows, 20.0)}
     assert found == {
         ("hjepa, innovation", "hjepa, round-robin"): 1.5,
         ("ts-jepa-1, innovation", "ts-jepa-1, round-robin"): 120 / 90,
@@ -253,12 +257,14 @@ def test_gains_name_the_best_rivals():
         ("hjepa, innovation", "ts-jepa-1, innovation"): 150 / 120,
         ("hjepa, innovation", "oracle, innovation"): 0.75,
     }
-    assert scheduled.gains(rows, 10.0) == []
+    assert count.gains(rows, 10.0) == []
 
 
-def test_a_report_shows_every_scheduler(stage):
+def test_a_report_shows_every_scheduler(stage, tmp_path):
     result = stage("hold-true", schedulers=["round-robin", "max-aoi"], snr_db="20")
-    shown = "".join(report.scale_section(result, {}))
+    page = tmp_path / "report.html"
+    report.run(Screen(quiet=True), [Path(result["csv"]).parent], out=page)
+    shown = page.read_text()
     assert "hold-true, max-aoi" in shown and "over hold-true, round-robin at 20 dB" in shown
 
 
@@ -271,7 +277,7 @@ def test_a_report_shows_every_scheduler(stage):
         (["--power-margin-db", "nan"], "nan"),
         (["--seeds", "0"], "0"),
         (["--topology", "street"], "street"),
-        (["--law", "duty", "--topology", "hall"], "topology hall"),
+        (["--law", "duty", "--topology", "hall"], "--topology is for the law"),
         (["--payload", "pca-8"], "unknown payload 'pca-8'"),
     ],
 )

@@ -32,7 +32,7 @@ class Clock:
         self.stride, self.exact, self.calls = stride, exact_actions, 0
 
     def __call__(
-        self, z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        self, z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor:
         self.calls += 1
         now = z[:, 1]
@@ -40,9 +40,9 @@ class Clock:
         if self.exact:
             expected = now[:, None] + torch.arange(self.stride)
             assert torch.equal(actions, expected), (actions, expected)
-        if anchor is not None:
-            assert torch.equal(anchor[:, 0], z[:, 0])
-            assert torch.equal(anchor[:, 1], now + remaining * self.stride)
+        if waypoint is not None:
+            assert torch.equal(waypoint[:, 0], z[:, 0])
+            assert torch.equal(waypoint[:, 1], now + remaining * self.stride)
         return z + torch.tensor([0.0, float(self.stride)])
 
 
@@ -64,7 +64,7 @@ def test_plan_stride_is_aligned(h: int, m: int, l: int) -> None:
         Clock(l, exact_actions=False),
         z,
         Strides(h, m, l),
-        recompute_anchor=True,
+        recompute_waypoint=True,
     )
     fine_steps = z[:, 1:] + torch.arange(0, h, l)
     assert torch.equal(embeddings[..., 1], fine_steps)
@@ -79,13 +79,13 @@ def test_anchor_is_recomputed_with_the_played_actions() -> None:
     expected: list[Tensor] = []
 
     def coarse(
-        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor:
         seen.append(actions)
         return z + torch.tensor([0.0, 4.0])
 
     def medium(
-        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor:
         expected.append(actions)
         return z + torch.tensor([0.0, 2.0])
@@ -102,7 +102,7 @@ def test_anchor_is_recomputed_with_the_played_actions() -> None:
             Clock(1, exact_actions=False),
             z,
             Strides(4, 2, 1),
-            recompute_anchor=recompute,
+            recompute_waypoint=recompute,
         )
         assert torch.equal(played, answered)
         assert torch.equal(torch.cat(seen), torch.cat(plays))
@@ -114,7 +114,7 @@ def test_the_medium_level_starts_from_the_action_of_its_own_step() -> None:
     seen: list[Tensor] = []
 
     def medium(
-        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor:
         seen.append(actions)
         return z + torch.tensor([0.0, 2.0])
@@ -128,29 +128,29 @@ def test_the_medium_level_starts_from_the_action_of_its_own_step() -> None:
             Clock(1, exact_actions=False),
             torch.tensor([[0.0, 0.0]]),
             Strides(8, 2, 1),
-            recompute_anchor=recompute,
+            recompute_waypoint=recompute,
         )
         first, again = [[0, 0], [2, 2], [4, 4]], [[0, 1], [2, 3], [4, 5]]
         assert [actions[0].tolist() for actions in seen] == first + again * recompute
 
 
 def test_planning_again_shrinks_the_error_of_a_held_action() -> None:
-    """Scalar plant z' = g z + u under u = -c z, P^H exact, P^M sure that c drives to the anchor:
-    the anchor of a held action leads it astray, and planning again cuts that by c / (g - c)."""
+    """Scalar plant z' = g z + u under u = -c z, P^H exact, P^M sure that c drives to the waypoint:
+    the waypoint of a held action leads it astray, and planning again cuts that by c / (g - c)."""
     g, c = 1.2, 0.3
 
     def coarse(
-        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor:
         for action in actions.T:
             z = g * z + action[:, None]
         return z
 
     def medium(
-        z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor:
-        assert anchor is not None
-        return anchor / (g - c)
+        assert waypoint is not None
+        return waypoint / (g - c)
 
     z, errors = torch.tensor([[1.0]]), []
     for recompute in (False, True):
@@ -161,7 +161,7 @@ def test_planning_again_shrinks_the_error_of_a_held_action() -> None:
             coarse,
             z,
             Strides(2, 1, 1),
-            recompute_anchor=recompute,
+            recompute_waypoint=recompute,
         )
         errors.append(float(played[0, 1]) + c * (g - c))
         assert torch.equal(z_next, coarse(z, played if recompute else played[:, :1].expand(-1, 2)))
@@ -190,7 +190,7 @@ def test_training_gaps_are_aligned(h: int, m: int, l: int, monkeypatch: pytest.M
 @pytest.mark.parametrize("stride", [1, 2, 3, 4, 5, 7, 12, 24])
 def test_rollouts_reach_their_targets(stride: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The golden index test of the target list k + h … k + K_p (paper §III-A)."""
-    from hjepa_cli.core.networks import hierarchy
+    from hjepa_cli.core.training import losses
 
     data, generator = fake(4, 100), np.random.default_rng(1)
     frames = data.window_frames(stride)
@@ -204,7 +204,7 @@ def test_rollouts_reach_their_targets(stride: int, monkeypatch: pytest.MonkeyPat
         reached.append(target[..., 1])
         return torch.arange(float(target.shape[1])).expand(len(target), -1)
 
-    monkeypatch.setattr(hierarchy, "cosine_similarity", compare)
+    monkeypatch.setattr(losses, "cosine_similarity", compare)
     starts = torch.tensor([0, 1, frames // 2]).unique()
     horizon = max(80 // stride, 1)
     loss = rollout_loss(Clock(stride), z, z, actions, starts, horizon)
@@ -223,9 +223,11 @@ def test_rollouts_reach_their_targets(stride: int, monkeypatch: pytest.MonkeyPat
 def test_rollout_and_fill_gap_keep_their_ends() -> None:
     data = fake(2, 30)
     actions = data.actions[:, :24].unflatten(1, (3, 8))
-    anchors = rollout(Clock(8), data.z[:, 0], actions)
-    assert torch.equal(anchors, data.z[:, ::8][:, :4])
-    filled = fill_gap(Clock(2), anchors[:, 0], anchors[:, 1], actions[:, 0].unflatten(1, (4, 2)))
+    waypoints = rollout(Clock(8), data.z[:, 0], actions)
+    assert torch.equal(waypoints, data.z[:, ::8][:, :4])
+    filled = fill_gap(
+        Clock(2), waypoints[:, 0], waypoints[:, 1], actions[:, 0].unflatten(1, (4, 2))
+    )
     assert torch.equal(filled, data.z[:, 0:9:2])
 
 

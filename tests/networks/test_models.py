@@ -61,21 +61,21 @@ def test_embeddings_have_length_sqrt_d_and_do_not_depend_on_the_batch() -> None:
 def test_a_zero_initialised_residual_predictor_is_the_identity_or_the_interpolation() -> None:
     torch.manual_seed(0)
     z = torch.nn.functional.normalize(torch.randn(4, 16), dim=-1) * 4
-    anchor = torch.nn.functional.normalize(torch.randn(4, 16), dim=-1) * 4
+    waypoint = torch.nn.functional.normalize(torch.randn(4, 16), dim=-1) * 4
     plain = Predictor(16, 32, 4)
     torch.testing.assert_close(plain(z, torch.randn(4, 4)), z)
-    anchored = Predictor(16, 32, 2, anchored=True, distances=4)
+    guided = Predictor(16, 32, 2, guided=True, distances=4)
     for remaining in (4, 3, 2):
-        line = z + (anchor - z) / remaining
+        line = z + (waypoint - z) / remaining
         expected = torch.nn.functional.normalize(line, dim=-1) * 4
-        predicted = anchored(z, torch.randn(4, 2), anchor, remaining)
+        predicted = guided(z, torch.randn(4, 2), waypoint, remaining)
         torch.testing.assert_close(predicted, expected)
 
 
 @pytest.mark.parametrize(
     ("strides", "inputs"),
     [
-        # P^H: z + h actions; P^M, P^L: z, anchor, actions, and the distance where it varies
+        # P^H: z + h actions; P^M, P^L: z, waypoint, actions, and the distance where it varies
         ((4, 2, 1), {"high": 20, "medium": 34, "low": 33, "flat": 17}),
         ((8, 2, 1), {"high": 24, "medium": 35, "low": 33, "flat": 17}),
         ((12, 6, 2), {"high": 28, "medium": 38, "low": 35, "flat": 17}),

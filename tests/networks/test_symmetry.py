@@ -172,15 +172,15 @@ def test_a_mirrored_stride_is_the_mirror_image_of_the_stride(
     levels = [built[name] for name in ("high", "medium", "low")]
 
     def play(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return plan_stride(actor.act, *levels, z, strides, recompute_anchor=True)
+        return plan_stride(actor.act, *levels, z, strides, recompute_waypoint=True)
 
     with torch.no_grad():
-        actions, embeddings, anchor = play(z)
+        actions, embeddings, waypoint = play(z)
         of_mirror = play(reflect(z))
     mirror = signs if shape else signs[0]
     torch.testing.assert_close(of_mirror[0], mirror * actions, **TOLERANCE)
     torch.testing.assert_close(of_mirror[1], reflect(embeddings), **TOLERANCE)
-    torch.testing.assert_close(of_mirror[2], reflect(anchor), **TOLERANCE)
+    torch.testing.assert_close(of_mirror[2], reflect(waypoint), **TOLERANCE)
     assert actions.std() > 1e-2
 
 

@@ -10,7 +10,8 @@ from command_line import assert_one_line_error, open_shell
 from scipy import stats
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.storage.runs import Run
+from hjepa_cli.storage import seals
+from hjepa_cli.storage.runs import Run, read_result
 from hjepa_cli.storage.zoo import zoo_directory
 
 ZOO = json.loads((zoo_directory() / "desktop-h4m2l1" / "curves.json").read_text())["methods"]
@@ -23,8 +24,10 @@ def entry(method, seed):
     found = copy.deepcopy(ZOO[method])
     if method in GAPS:
         found["tolerance_gap_steps"] = GAPS[method][seed]
+        found["tolerance_gap_ci95"] = [0.9 * GAPS[method][seed], 1.1 * GAPS[method][seed]]
         found["nmae_windows"]["1-20"] = ERRORS[method][seed]
         found["nmae"] = [value + 0.001 * seed for value in found["nmae"]]
+        found["nmae_ci95"] = [[end + 0.001 * seed for end in ends] for ends in found["nmae_ci95"]]
     return found
 
 
@@ -47,6 +50,11 @@ def evaluated(training, methods=("hjepa", "ts-jepa-4", "oracle"), name=None, **c
     with Run.create("eval", directory, settings) as record:
         record.finish(result | changes)
     return directory
+
+
+def reseal(path, document):
+    """Write a result that lies, under the right seal."""
+    path.write_text(json.dumps(seals.sealed(document)))
 
 
 @pytest.fixture
@@ -136,8 +144,8 @@ def test_two_models_of_one_seed_are_refused(shell):
     assert shell("compare").code == 0  # the same numbers again are no contradiction
     other = evaluated(1, ("hjepa",), "other")
     document = json.loads((other / "result.json").read_text())
-    document["methods"]["hjepa"]["score"] = 0.5
-    (other / "result.json").write_text(json.dumps(document))
+    document["methods"]["hjepa"] |= {"score": 0.5, "score_ci95": [0.4, 0.6]}
+    reseal(other / "result.json", document)
     assert_one_line_error(shell("compare"), 65, "two measurements of hjepa", "training seed 1")
 
 
@@ -174,7 +182,7 @@ def test_a_run_of_an_older_version_says_how_to_measure_it_again(shell):
     old = evaluated(1)
     document = json.loads((old / "result.json").read_text())
     del document["training_seeds"]
-    (old / "result.json").write_text(json.dumps(document))
+    reseal(old / "result.json", document)
     outcome = shell("compare")
     assert_one_line_error(outcome, 65, "older version")
     assert "hjepa eval --config runs/eval/seed-1/config.toml --out" in outcome.err
@@ -211,9 +219,10 @@ def test_bounds_have_no_ratio_and_intervals_stay_in_range(shell):
         document = json.loads(path.read_text())
         document["methods"]["hjepa"] |= {
             "tolerance_gap_steps": gap,
+            "tolerance_gap_ci95": [0.9 * gap, 1.1 * gap],
             "tolerance_gap_censored": seed == 1,
         }
-        path.write_text(json.dumps(document))
+        reseal(path, document)
     document = shell("compare", "--json").document
     low, high = document["methods"]["hjepa"]["tolerance_gap_ci95"]
     assert low == 0 < 161 < high
@@ -224,9 +233,9 @@ def test_bounds_have_no_ratio_and_intervals_stay_in_range(shell):
 @pytest.mark.parametrize(
     ("key", "value", "reason"),
     [
-        ("training_seeds", [1], "with which seeds"),
+        ("training_seeds", [1], "training_seeds"),
         ("training_seeds", {"hjepa": True, "ts-jepa-4": True}, "does not say with which seed"),
-        ("methods", [], "no methods"),
+        ("methods", [], "methods"),
         ("methods", {"hjepa": None}, "method 'hjepa'"),
         ("horizon", [0], "over the horizon"),
     ],
@@ -234,7 +243,7 @@ def test_bounds_have_no_ratio_and_intervals_stay_in_range(shell):
 def test_damaged_results_are_named(shell, key, value, reason):
     evaluated(0)
     path = evaluated(1) / "result.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    reseal(path, json.loads(path.read_text()) | {key: value})
     assert_one_line_error(shell("compare"), 65, "runs/eval/seed-1", reason)
 
 
@@ -242,7 +251,7 @@ def test_rollouts_of_one_training_are_the_same(shell):
     settings = load_settings().as_dict()
     for seed in range(2):
         evaluated(seed)
-    first = json.loads(Path("runs/eval/seed-1/result.json").read_text())
+    first = read_result(Path("runs/eval/seed-1"))
     inputs = {"dataset": {"path": "data", "sha256": "f" * 64}}
     with Run.create("eval", Path("runs/eval/other"), settings, inputs) as record:
         record.finish(first)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
-from hjepa_cli.config.checks import COMPARED, METHODS
+from hjepa_cli.config.checks import compared_methods
 from hjepa_cli.output import figures
-from hjepa_cli.output.comparison import WIDTH_IN, comparison_figure
+from hjepa_cli.output.figures import TWO_COLUMNS_IN, comparison_figure
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.zoo import zoo_directory
 
 
@@ -41,7 +42,7 @@ def panels(figure):
 def test_it_is_two_columns_wide_and_equal_byte_for_byte(tmp_path):
     first = figures.save(drawn(entries()), tmp_path / "first.png").read_bytes()
     assert figures.save(drawn(entries()), tmp_path / "second.png").read_bytes() == first
-    assert drawn(entries()).get_figwidth() == WIDTH_IN
+    assert drawn(entries()).get_figwidth() == TWO_COLUMNS_IN[0]
 
 
 def test_every_method_is_named_once_and_drawn_where_it_was_measured():
@@ -76,9 +77,11 @@ def test_what_an_older_version_did_not_measure_is_left_out():
 
 def test_all_methods_differ_in_colour_or_marker():
     styles = [figures.method_style(name, list(METHODS)) for name in METHODS]
-    assert len({(style.colour, style.marker, style.hollow) for style in styles}) == len(METHODS)
+    assert len({(style.colour, style.marker, style.hollow) for style in styles}) == len(
+        list(METHODS)
+    )
     assert len({style.marker + str(style.line) + str(style.hollow) for style in styles}) > 12
-    assert set(COMPARED) <= set(METHODS)
+    assert set(compared_methods()) <= set(METHODS)
 
 
 def test_eval_draws_it(tmp_path):

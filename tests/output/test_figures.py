@@ -9,8 +9,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from hjepa_cli.config.checks import SCHEDULERS
+from hjepa_cli import plugins
 from hjepa_cli.errors import UsageError
+from hjepa_cli.plugins import SCHEDULERS
 
 matplotlib = pytest.importorskip("matplotlib")
 from hjepa_cli.output import figures  # noqa: E402 - needs matplotlib
@@ -100,8 +101,9 @@ def test_methods_differ_without_colour():
 
 
 def test_every_look_is_one_method_s_also_without_colour():
-    looks = {(style.marker, style.hollow) for style in figures.STYLES.values()}
-    assert len(looks) == len(figures.STYLES)
+    styles = [plugins.METHODS[name].style for name in plugins.METHODS]
+    looks = {(style.marker, style.hollow) for style in styles}
+    assert len(looks) == len(styles)
 
 
 def test_curves_on_top_of_each_other_all_stay_visible():
@@ -188,7 +190,7 @@ def scheduled_rows(methods=("hjepa", "hold"), snr_db=(10.0, 20.0, 30.0)):
     return [
         {**row, "method": method, "scheduler": row["method"]}
         for method in methods
-        for row in rows(list(figures.SCHEDULER_STYLES), snr_db=snr_db)
+        for row in rows(list(SCHEDULERS), snr_db=snr_db)
     ]
 
 
@@ -199,7 +201,7 @@ def test_every_scheduler_is_a_line_in_its_method_s_panel(snr_db):
     assert len(figure.axes) == 2 and figure.axes[0].get_title() == "a cell"
     for axes in figure.axes:
         drawn = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-        assert list(drawn) == list(figures.SCHEDULER_STYLES)
+        assert list(drawn) == list(SCHEDULERS)
         for rank, bars in enumerate(drawn.values()):
             line, _, (interval,) = bars.lines
             assert list(line.get_ydata()) == [int(100 * (rank + 1) * snr) for snr in snr_db]
@@ -209,7 +211,6 @@ def test_every_scheduler_is_a_line_in_its_method_s_panel(snr_db):
 
 
 def test_schedulers_differ_without_colour():
-    looks = {
-        (style.marker, str(style.line), style.hollow) for style in figures.SCHEDULER_STYLES.values()
-    }
-    assert len(looks) == len(SCHEDULERS) and set(figures.SCHEDULER_STYLES) == set(SCHEDULERS)
+    styles = [SCHEDULERS[name].style for name in SCHEDULERS]
+    looks = {(style.marker, str(style.line), style.hollow) for style in styles}
+    assert len(looks) == len(styles)

@@ -13,17 +13,14 @@ from test_evaluate import untrained
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.loop import Draws, every_step, simulate
-from hjepa_cli.core.control.methods import true_state_method
+from hjepa_cli.core.control.methods.true_state import true_state_driver
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.stages.view import Believer, Film, Link, make_link
 
 image_module = pytest.importorskip("PIL.Image")
-from hjepa_cli.output import (
-    animation,  # noqa: E402 - needs Pillow
-    live,  # noqa: E402 - needs Pillow
-)
+from hjepa_cli.output import animation, live  # noqa: E402 - needs pillow
 
 SMALL = """
 [collect]
@@ -88,7 +85,7 @@ def test_a_probe_reads_what_embeddings_hold_linearly():
 def test_watching_a_loop_sees_every_state_and_force():
     settings = load_settings("smoke")
     draws = Draws.make(settings.protocol, 2, 0)
-    method = true_state_method("optimal", plant("desktop"), 1)
+    method = true_state_driver("optimal", plant("desktop"), 1)
     sensed, watched = [], []
 
     def sensor(seen):

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from hjepa_cli.api import drive, load_model
-from hjepa_cli.config.settings import Settings, load_settings
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import load_dataset
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation.curves import Digest
@@ -89,7 +90,7 @@ def test_a_controller_that_does_not_know_does_worse() -> None:
     def score(**conditions: float) -> float:
         simulator = Simulator(settings(**conditions), None)
         block = Block("oracle", (Point("gap", 120.0),), 0, 16)
-        return float(simulator.run(block, lambda steps: None).score.mean())
+        return float(block.compute(simulator, lambda steps: None).score.mean())
 
     assert score(pole_length=0.7) < score() - 0.1
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.core.plants.cartpole import dynamics
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 from hjepa_cli.core.plants.named import START, CartPole, plant, teacher
 from hjepa_cli.errors import UsageError
@@ -94,31 +93,36 @@ def test_error_falls_with_the_square_of_the_substep(name):
 def test_derivative_is_lagranges(name):
     states = generator(2).uniform(-1, 1, (200, 4)) * [1, 5, 4, 30]
     forces_n = generator(3).uniform(-20, 20, 200)
-    ours = dynamics.derivative(PLANTS[name], states, forces_n)
+    ours = PLANTS[name].derivative(states, forces_n)
     np.testing.assert_allclose(ours, rate(PLANTS[name], states, forces_n), rtol=1e-11, atol=1e-10)
-    stacked = dynamics.derivative(PLANTS[name], states.reshape(4, 50, 4), forces_n.reshape(4, 50))
+    stacked = PLANTS[name].derivative(states.reshape(4, 50, 4), forces_n.reshape(4, 50))
     np.testing.assert_array_equal(stacked.reshape(200, 4), ours)
 
 
 def test_derivative_golden_values():
     """Gymnasium's geometry at g = 9.81, linearised by hand."""
     unit = np.eye(4) * 1e-6
-    columns = dynamics.derivative(PLANTS["gym"], unit, np.zeros(4)) / 1e-6
+    columns = PLANTS["gym"].derivative(unit, np.zeros(4)) / 1e-6
     assert columns[2] == pytest.approx([0, -0.717804878, 0, 15.7917073171], abs=1e-7)
-    push = dynamics.derivative(PLANTS["gym"], np.zeros(4), 1.0)
+    push = PLANTS["gym"].derivative(np.zeros(4), 1.0)
     assert push == pytest.approx([0, 0.9756097561, 0, -1.4634146341], abs=1e-9)
 
 
 def test_rk4_is_of_fourth_order():
-    kind, start = PLANTS["gym"], np.array([[0.1, -0.3, 0.5, 2.0]])
+    start = np.array([[0.1, -0.3, 0.5, 2.0]])
+
+    def advance(states, parts):
+        shorter = dataclasses.replace(PLANTS["gym"], step_s=0.05 / parts)
+        return shorter.advance(states, np.array([5.0]))
+
     exact = start
     for _ in range(64):
-        exact = dynamics.rk4_step(kind, exact, [5.0], 0.05 / 64)
+        exact = advance(exact, 64)
 
     def error(parts):
         states = start
         for _ in range(parts):
-            states = dynamics.rk4_step(kind, states, [5.0], 0.05 / parts)
+            states = advance(states, parts)
         return np.abs(states - exact).max()
 
     assert 12 < error(1) / error(2) < 20
@@ -191,12 +195,12 @@ def test_many_devices_are_as_many_single_ones():
     devices = 7
     scale = generator(5).uniform(0.8, 1.2, (devices, 2))
     initial, forces_n = starts("desktop", devices), generator(6).uniform(-20, 20, (200, devices))
-    together = CartPoles("desktop", devices, mass_scale=scale)
+    together = CartPoles(PLANTS["desktop"], devices, mass_scale=scale)
     together.states = initial
     for k in range(200):
         together.step(forces_n[k])
     for i in range(devices):
-        alone = CartPoles("desktop", 1, mass_scale=scale[i : i + 1])
+        alone = CartPoles(PLANTS["desktop"], 1, mass_scale=scale[i : i + 1])
         alone.states = initial[i : i + 1]
         for k in range(200):
             alone.step(forces_n[k, i : i + 1])
@@ -223,7 +227,10 @@ def test_mass_scale_scales_cart_and_pole():
 def test_reading_and_writing_at_every_step_changes_nothing_that_matters():
     """Noise is added that way, 0.03 rad/s a step. Also: pymunk once overran the buffers."""
     for devices in (1, 64):
-        touched, untouched = CartPoles("desktop", devices), CartPoles("desktop", devices)
+        touched, untouched = (
+            CartPoles(PLANTS["desktop"], devices),
+            CartPoles(PLANTS["desktop"], devices),
+        )
         touched.states = untouched.states = starts("desktop", devices)
         for _ in range(60):
             touched.states = touched.states
@@ -259,7 +266,7 @@ def test_a_seed_fixes_the_start():
 
 def test_two_simulations_are_bitwise_equal():
     def simulate():
-        poles = CartPoles("gym", 5)
+        poles = CartPoles(PLANTS["gym"], 5)
         poles.states = starts("gym", 5)
         for k in range(100):
             poles.step(np.full(5, np.sin(k)))
@@ -268,7 +275,7 @@ def test_two_simulations_are_bitwise_equal():
     np.testing.assert_array_equal(simulate(), simulate())
 
 
-@pytest.mark.parametrize("build", [plant, CartPole, lambda name: CartPoles(name, 1)])
+@pytest.mark.parametrize("build", [plant, CartPole])
 def test_an_unknown_plant_names_the_choices(build):
     with pytest.raises(UsageError, match=r"moon.*desktop, gym"):
         build("moon")
@@ -276,12 +283,12 @@ def test_an_unknown_plant_names_the_choices(build):
 
 def test_impossible_devices_are_refused():
     with pytest.raises(UsageError, match="devices = 0"):
-        CartPoles("desktop", 0)
+        CartPoles(PLANTS["desktop"], 0)
     for scale in ([[1.0, 0.0]], [[1.0, np.nan]], [[1.0, 1.0], [1.0, 1.0]]):
         with pytest.raises(UsageError, match="mass_scale"):
-            CartPoles("desktop", 1, mass_scale=scale)
+            CartPoles(PLANTS["desktop"], 1, mass_scale=scale)
     with pytest.raises(ValueError, match="shape"):
-        CartPoles("desktop", 2).states = np.zeros(4)
+        CartPoles(PLANTS["desktop"], 2).states = np.zeros(4)
 
 
 def test_streams_are_named_and_independent():

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from command_line import ENVIRONMENT, ROOT
+from played import play
 from test_evaluate import untrained
 
 import hjepa_cli
-from hjepa_cli.core.control.codecs import Integers
-from hjepa_cli.core.control.loop import play
-from hjepa_cli.core.control.methods import embedding_method
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.errors import DataError, UsageError
 
 QUICK = {
@@ -69,7 +69,7 @@ def test_predict_plays_what_the_controller_plays(model):
     z = torch.nn.functional.normalize(torch.randn(3, 256), dim=-1) * 16
     for method in ("hjepa", "ts-jepa-1"):
         forces_n, _ = hjepa_cli.predict(model, z, 11, method=method)
-        controller = embedding_method(method, model, Integers(256, 8)).controller(3)
+        controller = build_driver(method, load_settings(), model).controller(3)
         np.testing.assert_allclose(forces_n.numpy(), play(controller, z, 3, 11), rtol=1e-6)
     whole, z_whole = hjepa_cli.predict(model, z, 8)
     part, z_part = hjepa_cli.predict(model, z, 4)
@@ -142,6 +142,27 @@ def test_a_model_of_another_plant_is_refused(tmp_path):
 def test_a_simulated_cell_refuses_what_the_stage_does_not_schedule(model, method, says):
     with pytest.raises(UsageError, match=says):
         hjepa_cli.simulate_cell(method, model=model, devices=4, settings=QUICK)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("topology", "hall"),
+        ("harq_rounds", 2),
+        ("overhead_bits", 24),
+        ("seeds", 2),
+        ("schedulers", ("max-aoi",)),
+        ("bandwidth_hz", 1e6),
+        ("law", "equal"),
+    ],
+)
+def test_a_simulated_cell_refuses_settings_that_it_does_not_read(name, value):
+    law = {"radio.law": "scheduled", "radio.block_error": 0.1}
+    with pytest.raises(UsageError, match=f"radio.{name} = .* is for hjepa scale"):
+        hjepa_cli.simulate_cell(
+            "hold-true", devices=4, settings=QUICK | law | {f"radio.{name}": value}
+        )
+    assert hjepa_cli.simulate_cell("hold-true", devices=4, settings=QUICK | law)["packets"].sum()
 
 
 def test_a_simulated_cell_needs_two_slots():

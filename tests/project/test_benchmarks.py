@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hjepa_cli.config.checks import METHODS, check_settings
+from hjepa_cli.config.checks import check_settings
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.plugins import METHODS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SCRIPTS = sorted((REPOSITORY / "benchmarks").glob("*.py"))

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402 - needs gymnasiu
 
 import hjepa_cli.gym  # noqa: E402 - needs gymnasium
 from hjepa_cli.config.settings import load_settings  # noqa: E402
-from hjepa_cli.core.control.loop import World  # noqa: E402
+from hjepa_cli.core.control.loop import ScoredPlants  # noqa: E402
 from hjepa_cli.core.plants.named import Camera, CartPole, plant, teacher  # noqa: E402
 from hjepa_cli.errors import NumericalError, UsageError  # noqa: E402
 
@@ -50,7 +50,7 @@ def test_an_episode_starts_where_the_closed_loop_does(kind):
     protocol = load_settings("gym" if kind == "gym" else None).protocol
     random, _ = gymnasium.utils.seeding.np_random(3)
     initial = random.uniform(-1, 1, (1, 4)) * protocol.half_widths
-    world = World(plant(kind), initial, np.ones((1, 2)), iter(()))
+    world = ScoredPlants(plant(kind), initial, np.ones((1, 2)), iter(()))
     np.testing.assert_array_equal(info["state"], world.states[0])
     assert (info["state"] != initial[0]).any()
     np.testing.assert_allclose(observation, world.states[0], rtol=1e-6)

@@ -7,6 +7,7 @@ import pytest
 from command_line import assert_one_line_error, open_shell
 
 from hjepa_cli.errors import Interrupted, NumericalError
+from hjepa_cli.plugins import STAGES
 from hjepa_cli.stages import (
     collect,
     evaluate,
@@ -60,8 +61,10 @@ def test_the_stages_run_in_order_on_each_others_results(shell, calls):
     assert inputs["collect"]["out"] == Path("f/data")
     for name in ORDER[1:]:
         assert inputs[name]["dataset"] == Path("f/data") and inputs[name]["out"] == Path("f", name)
-    assert inputs["train-hierarchy"]["encoder"] == "f/train-encoder/model.safetensors"
-    assert inputs["eval"]["checkpoint"] == inputs["scale"]["checkpoint"] == "f/train-hierarchy"
+    assert inputs["train-hierarchy"]["encoder"] == Path("f/train-encoder/model.safetensors")
+    assert (
+        inputs["eval"]["checkpoint"] == inputs["scale"]["checkpoint"] == Path("f/train-hierarchy")
+    )
     assert document["report"] == "f/report.html" and document["eval"] == {"stage": "eval"}
 
 
@@ -147,12 +150,12 @@ def test_what_a_late_stage_would_refuse_is_refused_at_once(shell, calls, flags, 
 
 def test_the_methods_it_serves_are_those_of_the_models_it_trains():
     """Also of one level, of a depth of one, and of plants of six states."""
-    from hjepa_cli.config.checks import TRUE_STATE
+    from hjepa_cli.config.checks import without_model
     from hjepa_cli.config.settings import load_settings
 
     def served(preset, h, m, l):
         flags = {"hierarchy.h": h, "hierarchy.m": m, "hierarchy.l": l}
-        return set(reproduce.servable(load_settings(preset, flags=flags))) - set(TRUE_STATE)
+        return set(reproduce.servable(load_settings(preset, flags=flags))) - set(without_model())
 
     always = {"ts-jepa-1", "hold", "zero", "linear", "state-kf", "local"}
     assert served(None, 8, 2, 1) == always | {"hjepa", "ts-jepa-8", "state-48"}
@@ -189,6 +192,6 @@ def test_the_stages_take_what_they_are_given():
                 return {}
 
             patch.setattr(module, "run", run)
-        for stage in reproduce.stages(settings, screen, Path("f")).values():
-            stage()
+        for name, inputs in reproduce.inputs_in(Path("f")).items():
+            STAGES[name].run(settings, screen, **inputs)
     assert len(bound) == len(ORDER)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.core.control.drivers import build_driver, methods_of
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
@@ -38,7 +38,8 @@ def load(name):
 
 def shown_of(model):
     """The methods that the model is about."""
-    return ("hjepa", "hold") if "hjepa" in model.methods else model.methods[:1]
+    offered = methods_of(model)
+    return ("hjepa", "hold") if "hjepa" in offered else offered[:1]
 
 
 def card_of(name):
@@ -104,7 +105,7 @@ def test_a_few_devices_score_as_on_the_card(name):
 
     def scores(method, gap):
         block = Block(method, (Point("gap", gap),), 0, DEVICES)
-        return simulator.run(block, lambda steps: None).score
+        return block.compute(simulator, lambda steps: None).score
 
     teacher = scores("optimal", 1.0)
     entries = files.read_json(zoo.zoo_directory() / name / zoo.CURVES_FILE)["methods"]
@@ -116,7 +117,7 @@ def test_a_few_devices_score_as_on_the_card(name):
         measured = float(ratio(scores(method, gap_steps), teacher[0])[0])
         assert abs(measured - score) <= 3 * standard_error, (method, measured)
         assert (
-            build_method(method, settings, model).bits_per_transmission
+            build_driver(method, settings, model).bits_per_transmission
             == (entries[method]["bits_per_transmission"])
         )
 

@@ -8,8 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hjepa_cli.config.schema import RadioSettings
 from hjepa_cli.core.radio import capacity
 from hjepa_cli.core.radio.channel import outage_probability
+from hjepa_cli.core.radio.laws import duty, equal
+from hjepa_cli.core.radio.laws.scheduled import ScheduledBand
 from hjepa_cli.errors import UsageError
 
 getcontext().prec = 50
@@ -23,6 +26,16 @@ def exact_log2(x):
 
 def exact_ratio(snr_db):
     return Decimal(10) ** (Decimal(snr_db) / 10)
+
+
+def test_a_packet_that_fills_its_slot_exactly_is_on_time():
+    # b = k W τ_o at 2^k − 1: c is 1 whatever rounding makes of it.
+    k = np.arange(1, 31)
+    c = capacity.slot_capacity(1000.0 * k, 1e6, 1e-3, 10 * np.log10(2.0**k - 1))
+    assert np.any(c < 1) and np.all(capacity.late_slots(c) == 0)
+    band = ScheduledBand(capacity.Cell(1e6, 1e-3, 0.0), RadioSettings(), 0.62)
+    for bits, snr_db in zip(1000 * k, 10 * np.log10(2.0**k - 1), strict=True):
+        assert band.fits(int(bits), snr_db) and not band.fits(int(bits) + 1, snr_db)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +57,7 @@ def test_packets_per_slot_at_5_10_and_20_db(payload_bits, expected):
 
 def test_one_transmission_per_slot_supports_16_float_and_65_int8_devices_at_20_db():
     c = capacity.slot_capacity([8192, 2048], snr_db=20.0, **CELL)
-    assert list(capacity.duty_devices(1.0, c)) == [16, 65]
+    assert list(duty.duty_devices(1.0, c)) == [16, 65]
 
 
 @given(
@@ -55,7 +68,7 @@ def test_one_transmission_per_slot_supports_16_float_and_65_int8_devices_at_20_d
 def test_duty_is_the_exact_floor(gap, bits, snr_db):
     c = Decimal(20_000) / bits * exact_log2(1 + exact_ratio(snr_db))
     exact = Decimal(gap) * c
-    n = capacity.duty_devices(gap, capacity.slot_capacity(bits, snr_db=snr_db, **CELL))
+    n = duty.duty_devices(gap, capacity.slot_capacity(bits, snr_db=snr_db, **CELL))
     if abs(exact - round(exact)) > exact * Decimal("1e-11"):  # undecidable in double precision
         assert n == int(exact)
 
@@ -65,23 +78,23 @@ def test_whole_numbers_are_not_lost_to_rounding():
     k = np.arange(1, 21)[:, None]
     gap = np.arange(1, 401)
     c = capacity.slot_capacity(2000, snr_db=10 * np.log10(2.0**k - 1), **CELL)
-    assert np.array_equal(capacity.duty_devices(gap, c), gap * 10 * k)
+    assert np.array_equal(duty.duty_devices(gap, c), gap * 10 * k)
     # The same for the equal law: −γ ln p = 2^k − 1 makes N = 10 k.
     p = np.exp(-(2.0 ** k[:10] - 1) / 100)
-    assert np.array_equal(capacity.equal_devices(p, 2000, snr_db=20.0, **CELL), 10 * k[:10])
+    assert np.array_equal(equal.equal_devices(p, 2000, snr_db=20.0, **CELL), 10 * k[:10])
 
 
 def test_a_frame_larger_than_a_slot_arrives_late():
     c = capacity.slot_capacity([2048, 393_216], snr_db=20.0, **CELL)
     assert capacity.late_slots(c) == pytest.approx([0.0, 1 / 0.33866], rel=1e-4)
     assert capacity.late_slots(1.0) == 0.0
-    assert capacity.duty_devices(2.9, c[1]) == 0  # even alone, a loop would wait too long
-    assert capacity.duty_devices(3.0, c[1]) == 1
+    assert duty.duty_devices(2.9, c[1]) == 0  # even alone, a loop would wait too long
+    assert duty.duty_devices(3.0, c[1]) == 1
 
 
 def test_equal_law_of_the_measured_delivery_tolerances():
     """Oracle, hold and zero on the true state: at most 20 % apart, whatever predicts."""
-    n = capacity.equal_devices([0.0101, 0.0369, 0.187], 2048, snr_db=20.0, **CELL)
+    n = equal.equal_devices([0.0101, 0.0369, 0.187], 2048, snr_db=20.0, **CELL)
     assert list(n) == [86, 81, 72]
 
 
@@ -96,7 +109,7 @@ def test_equal_law_of_the_measured_delivery_tolerances():
 def test_equal_law_of_loops_that_die_after_k_losses(snr_db, expected):
     """One loss run of K = 1, 2, 3, 5, 10, 15 slots per 100: outage 0.01^(1/K)."""
     outage = 0.01 ** (1 / np.array([1, 2, 3, 5, 10, 15]))
-    n = capacity.equal_devices(1 - outage, 2048, snr_db=snr_db, **CELL)
+    n = equal.equal_devices(1 - outage, 2048, snr_db=snr_db, **CELL)
     assert list(n) == [math.floor(value) for value in expected]
 
 
@@ -107,7 +120,7 @@ def test_equal_law_of_loops_that_die_after_k_losses(snr_db, expected):
 )
 def test_equal_is_the_exact_floor(p, bits, snr_db):
     exact = Decimal(20_000) / bits * exact_log2(1 - exact_ratio(snr_db) * Decimal(p).ln())
-    n = capacity.equal_devices(p, bits, snr_db=snr_db, **CELL)
+    n = equal.equal_devices(p, bits, snr_db=snr_db, **CELL)
     if abs(exact - round(exact)) > exact * Decimal("1e-11"):
         assert n == int(exact)
 
@@ -126,31 +139,60 @@ def test_equal_is_the_largest_number_that_still_gets_through(noise, p, snr_db, b
 
     largest = max((n for n in range(1, 400) if delivered(n) >= p), default=0)
     assert largest < 399
-    assert capacity.equal_devices(p, bits, snr_db=snr_db, noise=noise, **CELL) == largest
+    assert equal.equal_devices(p, bits, snr_db=snr_db, noise=noise, **CELL) == largest
+
+
+def newton(packets_per_bit, weakest):
+    """n = k log2(1 + n a) from above by Newton's steps: concave, so never past the root."""
+    k, a = packets_per_bit / math.log(2), weakest
+    n = k**2 * a  # since ln(1 + x) ≤ √x
+    for _ in range(100):
+        x = n * a
+        n = k * (np.log1p(x) - x / (1 + x)) / (1 - k * a / (1 + x))  # nothing cancels far above
+    return n
+
+
+def test_lamberts_function_agrees_with_newtons_method_on_all_valid_inputs():
+    """k = W τ/b of 1 Hz to 100 GHz, 1 to 20 ms, 1 bit to a raw pair of frames: 2.5e-9 to 2e9;
+    a = −γ̄ ln p* up to 100 dB and p* = 1e-300: 7e12. Half of the draws lie towards s = 1, where the
+    root vanishes and is known to about ε/(1 − s) only: s itself is known to ε. 8 ε of each."""
+    random = np.random.default_rng(0)
+    k = 10 ** random.uniform(math.log10(2.5e-9), math.log10(2e9), 40_000)
+    s = np.concatenate(
+        [10 ** random.uniform(-22, 0, 20_000), 1 - 10 ** random.uniform(-9, 0, 20_000)]
+    )
+    a = math.log(2) / (k * s)
+    k, s, a = k[a < 7e12], s[a < 7e12], a[a < 7e12]
+    expected = newton(k, a)
+    error = np.abs(equal.scaled_noise_devices(k, a) - expected) / expected
+    assert np.all(error < 8 * np.finfo(float).eps / (1 - s))
+    assert np.all(error[s < 0.99] < 1e-12)  # far below the 1e-12 that a count may be rounded up by
+    nobody = equal.scaled_noise_devices(k, 0.999 * math.log(2) / k)
+    assert not nobody.any() and not equal.scaled_noise_devices(k, 0.0).any()
 
 
 def test_scaled_noise_only_helps_and_agrees_for_one_device():
     n = np.arange(1, 60)
     scaled, fixed = (
-        capacity.equal_delivery_probability(n, 2064, snr_db=10.0, noise=noise, **CELL)
+        equal.equal_delivery_probability(n, 2064, snr_db=10.0, noise=noise, **CELL)
         for noise in ("scaled", "fixed")
     )
     assert scaled[0] == fixed[0]
     assert np.all(scaled[1:] > fixed[1:])
     p = np.array([0.01, 0.1, 0.5])
     assert np.all(
-        capacity.equal_devices(p, 2064, snr_db=10.0, noise="scaled", **CELL)
-        > capacity.equal_devices(p, 2064, snr_db=10.0, **CELL)
+        equal.equal_devices(p, 2064, snr_db=10.0, noise="scaled", **CELL)
+        > equal.equal_devices(p, 2064, snr_db=10.0, **CELL)
     )
 
 
 def test_the_delivery_probability_is_one_minus_the_outage_of_the_channel():
     n = np.array([1, 10, 50, 100])
     outage = outage_probability(2064 / 1e-3, 20e6 / n, 20.0)
-    p = capacity.equal_delivery_probability(n, 2064, snr_db=20.0, **CELL)
+    p = equal.equal_delivery_probability(n, 2064, snr_db=20.0, **CELL)
     assert p == pytest.approx(1 - outage, rel=1e-9)
     louder = outage_probability(2064 / 1e-3, 20e6 / n, 20.0 + 10 * np.log10(n))
-    p = capacity.equal_delivery_probability(n, 2064, snr_db=20.0, noise="scaled", **CELL)
+    p = equal.equal_delivery_probability(n, 2064, snr_db=20.0, noise="scaled", **CELL)
     assert p == pytest.approx(1 - louder, rel=1e-9)
 
 
@@ -158,10 +200,10 @@ def test_the_gain_of_a_predictor_falls_with_snr_under_equal_and_not_under_duty()
     snr_db = np.array([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0])
     tiny = {"payload_bits": 1, "bandwidth_hz": 20e6, "slot_s": 1.0, "snr_db": snr_db}  # no floors
     strong, weak = (1 - 0.01 ** (1 / k) for k in (10, 3))
-    gain = capacity.equal_devices(strong, **tiny) / capacity.equal_devices(weak, **tiny)
+    gain = equal.equal_devices(strong, **tiny) / equal.equal_devices(weak, **tiny)
     assert gain == pytest.approx([3.18, 2.50, 1.94, 1.61, 1.43, 1.32, 1.26], abs=5e-3)
     c = capacity.slot_capacity(**tiny)
-    assert capacity.duty_devices(100.0, c) / capacity.duty_devices(70.0, c) == pytest.approx(
+    assert duty.duty_devices(100.0, c) / duty.duty_devices(70.0, c) == pytest.approx(
         10 / 7, rel=1e-6
     )
 
@@ -169,32 +211,32 @@ def test_the_gain_of_a_predictor_falls_with_snr_under_equal_and_not_under_duty()
 def test_counts_grow_with_snr_bandwidth_and_tolerance_and_broadcast():
     snr_db = np.linspace(-10, 40, 51)
     c = capacity.slot_capacity(2064, snr_db=snr_db, **CELL)
-    n = capacity.duty_devices(np.array([[10.0], [100.0]]), c)
+    n = duty.duty_devices(np.array([[10.0], [100.0]]), c)
     assert n.shape == (2, 51) and n.dtype == np.int64
     assert np.all(np.diff(n, axis=0) >= 0) and np.all(np.diff(n, axis=1) >= 0)
     p = np.array([[0.5], [0.1], [0.01]])
     for noise in ("fixed", "scaled"):
-        n = capacity.equal_devices(p, 2064, snr_db=snr_db, noise=noise, **CELL)
+        n = equal.equal_devices(p, 2064, snr_db=snr_db, noise=noise, **CELL)
         assert n.shape == (3, 51) and n.dtype == np.int64
         assert np.all(np.diff(n, axis=0) >= 0) and np.all(np.diff(n, axis=1) >= 0)
 
 
 def test_a_loop_that_tolerates_nothing_supports_nobody():
-    assert capacity.duty_devices(0.0, 65.0) == 0
+    assert duty.duty_devices(0.0, 65.0) == 0
     for noise in ("fixed", "scaled"):
-        assert capacity.equal_devices(1.0, 2064, snr_db=20.0, noise=noise, **CELL) == 0
+        assert equal.equal_devices(1.0, 2064, snr_db=20.0, noise=noise, **CELL) == 0
 
 
 @pytest.mark.parametrize("gap", [-1.0, math.nan, math.inf])
 def test_impossible_gap_tolerances_are_refused(gap):
     with pytest.raises(UsageError, match="gap tolerance"):
-        capacity.duty_devices(gap, 65.0)
+        duty.duty_devices(gap, 65.0)
 
 
 @pytest.mark.parametrize("p", [0.0, -0.1, 1.1, math.nan])
 def test_impossible_delivery_tolerances_are_refused(p):
     with pytest.raises(UsageError, match="delivery tolerance"):
-        capacity.equal_devices(p, 2064, snr_db=20.0, **CELL)
+        equal.equal_devices(p, 2064, snr_db=20.0, **CELL)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
@@ -204,12 +246,12 @@ def test_impossible_cells_are_refused(name, bad):
     with pytest.raises(UsageError):
         capacity.slot_capacity(**cell | {name: bad})
     with pytest.raises(UsageError):
-        capacity.equal_devices(0.5, **cell | {name: bad})
+        equal.equal_devices(0.5, **cell | {name: bad})
 
 
 def test_unknown_noise_is_refused():
     with pytest.raises(UsageError, match="fixed or scaled"):
-        capacity.equal_devices(0.5, 2064, snr_db=20.0, noise="pink", **CELL)
+        equal.equal_devices(0.5, 2064, snr_db=20.0, noise="pink", **CELL)
 
 
 @pytest.mark.parametrize(

@@ -253,6 +253,27 @@ def test_outage_refuses_nonsense(arguments):
         channel.outage_probability(*arguments)
 
 
+@pytest.mark.parametrize("towards", [0.0, math.inf])
+def test_what_rounding_puts_beside_a_bound_is_on_it(towards):
+    for distance_m in channel.DISTANCE_3D_M:
+        beside = np.nextafter(distance_m, towards)
+        loss_db = channel.path_loss_db("InF-SL", 3.75, beside)
+        assert loss_db == pytest.approx(channel.path_loss_db("InF-SL", 3.75, distance_m))
+    for carrier_ghz in (0.5, 100.0):
+        assert channel.path_loss_db("InF-SL", np.nextafter(carrier_ghz, towards), 10.0) > 0
+    for snr_db in channel.SNR_DB:
+        beside = np.nextafter(snr_db, math.copysign(towards, snr_db))
+        assert channel.snr_ratio(beside) == pytest.approx(channel.snr_ratio(snr_db))
+    for wrong in (1 - 1e-9, 600 * (1 + 1e-9), math.nan):
+        with pytest.raises(UsageError, match="3D distance"):
+            channel.path_loss_db("InF-SL", 3.75, wrong)
+    with pytest.raises(UsageError, match="clutter density 1 is out of range"):
+        channel.line_of_sight_probability(
+            "InF-SL", 1.0, clutter_density=1.0, clutter_size_m=1.0, clutter_height_m=2.0,
+            bs_height_m=1.5, ue_height_m=1.5,
+        )  # fmt: skip
+
+
 def test_thermal_noise_of_the_cell():
     """−95 dBm of TS-JEPA's Table IV is thermal noise over 20 MHz with a 6 dB noise figure."""
     assert channel.thermal_noise_dbm(20e6, 0.0) == pytest.approx(-100.9897, abs=1e-4)

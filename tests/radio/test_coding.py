@@ -8,8 +8,6 @@ from scipy import stats
 
 from hjepa_cli.core.radio import channel
 from hjepa_cli.core.radio.coding import (
-    chase_outage_probability,
-    mean_age_slots,
     normal_approximation_error,
     packet_uses,
     round_errors,
@@ -71,47 +69,3 @@ def test_copies_of_a_packet_add_their_snrs():
     assert round_errors(2064, 100.0, 0.1, 16)[1] < 0.01  # also where SNRs end
     assert round_errors(2064, 20.0, 0.0, 4) == (0.0,)
     assert round_errors(2064, 20.0, 0.1, 3) == pytest.approx((0.1, 0.0, 0.0), abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("rate", "expected"), [(1, (0.0952, 0.0046)), (2, (0.259, 0.0369)), (4, (0.777, 0.443))]
-)
-def test_chase_combining(rate, expected):
-    found = chase_outage_probability(rate, 10.0, np.array([1, 2]))
-    assert found == pytest.approx(expected, abs=1.5e-3)  # of 2·10⁶ draws, 3 digits
-    gains = np.random.default_rng(0).standard_exponential((400_000, 3)).sum(axis=1)
-    failed = np.log2(1 + 10 * gains) < rate
-    outage = chase_outage_probability(rate, 10.0, 3)
-    assert abs(failed.mean() - outage) < 4 * math.sqrt(outage / len(gains))
-
-
-def test_one_round_is_the_outage_of_the_paper():
-    assert chase_outage_probability(2.5, 13.0, 1) == pytest.approx(
-        channel.outage_probability(2.5, 1.0, 13.0), rel=1e-12
-    )
-
-
-@pytest.mark.parametrize("chase", [False, True])
-def test_mean_age_by_simulation(chase):
-    rate, rounds, random = 4.0, 3, np.random.default_rng(0)
-    needed = (2**rate - 1) / 10
-    ages, age, taken, energy = [], 0, 0, 0.0
-    for slot, gain in enumerate(random.standard_exponential(300_000)):
-        if not chase or slot - taken == rounds or energy == 0.0:
-            taken, energy = slot, 0.0
-        energy += gain
-        age += 1
-        if energy >= needed:
-            age, energy = slot - taken, 0.0
-        ages.append(age)
-    expected = mean_age_slots(rate, 10.0, rounds=rounds, chase=chase)
-    assert np.mean(ages) == pytest.approx(expected, rel=0.02)
-
-
-def test_fresh_samples_win_where_most_attempts_succeed_and_lose_where_few_do():
-    ages = {
-        rate: [mean_age_slots(rate, 10.0, rounds=4, chase=chase) for chase in (False, True)]
-        for rate in (2.0, 5.0)
-    }
-    assert ages[2.0][0] < ages[2.0][1]
-    assert ages[5.0][0] > ages[5.0][1]

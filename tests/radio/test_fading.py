@@ -11,7 +11,6 @@ from scipy import stats
 from hjepa_cli.core.radio import channel
 from hjepa_cli.core.radio.fading import (
     block_fading,
-    burst_of_fading,
     gilbert_elliott,
     rician_power_gains,
 )
@@ -71,7 +70,7 @@ def test_bursts_of_correlated_fading():
     blocked = slots(20_000, 2, 50, coherence_slots=coherence) < threshold
     starts = blocked[1:] & ~blocked[:-1]
     runs = blocked[1:].sum() / starts.sum()
-    expected = burst_of_fading(1 - math.exp(-threshold), coherence)
+    expected = coherence / math.exp(-threshold)
     assert runs == pytest.approx(expected, rel=0.02)  # 50,000 runs, each about as long as its sd
 
 

@@ -29,10 +29,10 @@ def test_reference_drop():
     assert loss.mean() == pytest.approx(84.2, abs=4 * loss.std() / math.sqrt(1000))
 
 
-@pytest.mark.parametrize("scenario", list(hall.HALLS))
+@pytest.mark.parametrize("scenario", list(hall.FACTORY_HALLS))
 def test_every_hall(scenario):
     drop = hall.drop_devices(scenario, 3.75, 200, 0)
-    size = hall.HALLS[scenario]
+    size = hall.FACTORY_HALLS[scenario]
     assert np.all(np.abs(drop.position_m) <= [size.length_m / 2, size.width_m / 2])
     assert np.all(drop.distance_3d_m >= drop.distance_2d_m)
     assert np.all(drop.distance_2d_m >= hall.CLOSEST_M)
@@ -48,11 +48,28 @@ def test_every_hall(scenario):
             assert 0.5 < scatter.std() / SCENARIOS[kind].shadowing_db < 1.5
 
 
+@pytest.mark.parametrize(
+    ("scenario", "seed"),
+    [("InF-SL", seed) for seed in (61, 249, 266, 276, 282, 332)]
+    + [("InF-DL", 204), ("InF-DL", 367)],
+)
+def test_who_is_pushed_out_to_the_bound_stands_on_it(scenario, seed):
+    drop = hall.drop_devices(scenario, 3.75, 200, seed)
+    assert drop.distance_2d_m.min() == drop.distance_3d_m.min() == hall.CLOSEST_M
+    assert np.all(np.isfinite(drop.loss_db))
+
+
+def test_a_device_on_the_very_mast_is_pushed_out_too():
+    point = hall.FactoryHall(1e-12, 1e-12, 0.2, 10.0, 2.0, 1.5)
+    drop = hall.drop_devices("InF-SL", 3.75, 3, 0, factory_hall=point)
+    assert np.array_equal(drop.distance_3d_m, [hall.CLOSEST_M] * 3)
+
+
 def test_shadowing_is_correlated_over_ten_metres():
-    small = hall.Hall(40.0, 20.0, 0.2, 10.0, 2.0, 8.0)
+    small = hall.FactoryHall(40.0, 20.0, 0.2, 10.0, 2.0, 8.0)
     pairs = []
     for seed in range(400):
-        drop = hall.drop_devices("InF-LOS", 3.75, 2, seed, hall=small)
+        drop = hall.drop_devices("InF-LOS", 3.75, 2, seed, factory_hall=small)
         scatter = drop.loss_db - path_loss_db("InF-LOS", 3.75, drop.distance_3d_m)
         pairs.append([np.linalg.norm(np.diff(drop.position_m, axis=0)), scatter.prod() / 4.3**2])
     apart, product = np.array(pairs).T
@@ -95,14 +112,14 @@ def test_the_share_of_blocked_devices_is_the_rayleigh_outage():
 def test_bad_halls_are_refused():
     with pytest.raises(UsageError, match="unknown scenario"):
         hall.drop_devices("InF-XX", 3.75, 3, 0)
-    low_clutter = hall.Hall(300.0, 150.0, 0.2, 10.0, 1.5, 8.0)
+    low_clutter = hall.FactoryHall(300.0, 150.0, 0.2, 10.0, 1.5, 8.0)
     with pytest.raises(UsageError, match="not above the device"):
-        hall.drop_devices("InF-SH", 3.75, 3, 0, hall=low_clutter)
+        hall.drop_devices("InF-SH", 3.75, 3, 0, factory_hall=low_clutter)
     with pytest.raises(UsageError, match="carrier"):
         hall.drop_devices("InF-SH", 200.0, 3, 0)
-    huge = hall.Hall(3000.0, 150.0, 0.2, 10.0, 2.0, 8.0)
+    huge = hall.FactoryHall(3000.0, 150.0, 0.2, 10.0, 2.0, 8.0)
     with pytest.raises(UsageError, match="3D distance"):
-        hall.drop_devices("InF-SH", 3.75, 30, 0, hall=huge)
+        hall.drop_devices("InF-SH", 3.75, 30, 0, factory_hall=huge)
 
 
 @pytest.mark.slow
@@ -123,7 +140,10 @@ def test_path_loss_and_sight_equal_sionna_s():
         **double,
     )
     for name in ("SL", "DL", "SH", "DH"):
-        size, drop = hall.HALLS[f"InF-{name}"], hall.drop_devices(f"InF-{name}", 3.75, 50, 0)
+        size, drop = (
+            hall.FACTORY_HALLS[f"InF-{name}"],
+            hall.drop_devices(f"InF-{name}", 3.75, 50, 0),
+        )
         for in_sight, kind in ((False, f"InF-{name}"), (True, "InF-LOS")):
             peer = InFScenario(
                 3.75e9, name, antenna, antenna, "uplink", enable_shadow_fading=False, **double

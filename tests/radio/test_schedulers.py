@@ -1,74 +1,21 @@
-"""Schedulers and the cost engine behind them."""
-
-import itertools
+"""Schedulers and the growth of errors behind them."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import solve_discrete_are
 
-from hjepa_cli.core.control.error_growth import Growth, conformal_growth, periodic_cost
-from hjepa_cli.core.radio.schedulers import REPORTING, SCHEDULERS, pick
-from hjepa_cli.core.radio.schedulers.view import View
+from hjepa_cli.core.control.error_growth import ErrorGrowthTable, conformal_growth
+from hjepa_cli.core.radio.schedulers.scheduler import SlotView, pick
 from hjepa_cli.errors import UsageError
+from hjepa_cli.plugins import SCHEDULERS
 
-# --- The cost engine: three LQG loops on one channel --------------------------------------------
-
-
-def random_loops(seed):
-    """Unstable random loops as in demirelbu/periodic-schedules, from numpy's legacy generator."""
-    random = np.random.RandomState(seed).rand
-
-    def positive(size):
-        matrix = random(size, size)
-        return (matrix + matrix.T) / 2 + size * np.eye(size)
-
-    for _ in range(3):
-        a = random(2, 2)
-        while max(np.linalg.eigvals(a).real) < 1:
-            a = random(2, 2)
-        b, c = random(2, 1), random(1, 2)
-        yield a, b, c, positive(2), positive(1), positive(2), positive(1)
-
-
-def lqg_cost(loop, ages=12):
-    """Cost of a slot by age: tr SW + tr FM + tr M Z_A, Z_0 = 0, Z_{A+1} = A Z_A Aᵀ + K C P."""
-    a, b, c, q, r, w, v = loop
-    s, p = solve_discrete_are(a, b, q, r), solve_discrete_are(a.T, c.T, w, v)
-    weight = b.T @ s @ b + r
-    gain = np.linalg.solve(weight, b.T @ s @ a)
-    m = gain.T @ weight @ gain
-    learned = p @ c.T @ np.linalg.inv(c @ p @ c.T + v) @ c @ p
-    z, costs = np.zeros((2, 2)), []
-    for _ in range(ages):
-        costs.append(np.trace(s @ w) + np.trace((p - learned) @ m) + np.trace(m @ z))
-        z = a @ z @ a.T + learned
-    return np.array(costs)
-
-
-@pytest.mark.parametrize(
-    ("period", "minimum"), [(3, 576.2013), (4, 385.9708), (5, 399.8308), (6, 385.3658)]
-)
-def test_golden_costs_of_periodic_schedules(period, minimum):
-    costs = [lqg_cost(loop) for loop in random_loops(20)]
-    schedules = itertools.product(range(3), repeat=period)
-    assert min(periodic_cost(s, costs) for s in schedules) == pytest.approx(minimum, abs=5e-5)
-    if period == 4:
-        assert periodic_cost((1, 0, 2, 0), costs) == pytest.approx(minimum, abs=5e-5)
-
-
-def test_a_loop_that_never_sends_costs_everything():
-    assert periodic_cost((0, 0), [np.ones(5), np.ones(5)]) == np.inf
-    assert periodic_cost((0, 1, 1), [np.ones(2), np.ones(5)]) == np.inf  # age 2 has no cost
-
-
-# --- Growth and Whittle's index -----------------------------------------------------------------
+# --- Error growth and Whittle's index ---------------------------------------------------------
 
 
 def geometric(a, length=60):
     ages = np.arange(1, length + 1)
-    return Growth((a ** (2 * ages) - 1) / (a**2 - 1))
+    return ErrorGrowthTable((a ** (2 * ages) - 1) / (a**2 - 1))
 
 
 def test_index_by_its_definition():
@@ -127,9 +74,9 @@ def view(**changes):
         "queue": np.zeros(count),
         "reported": np.array([0.0, 0.1, 0.9, 0.3, 0.0]),
         "growth": geometric(1.1),
-        "doubt": np.ones(count),
+        "uncertainty": np.ones(count),
     }
-    return View(**{**known, **changes})
+    return SlotView(**{**known, **changes})
 
 
 @pytest.mark.parametrize(
@@ -143,16 +90,16 @@ def view(**changes):
     ],
 )
 def test_who_wins(name, order):
-    scores = SCHEDULERS[name](view())
+    scores = SCHEDULERS[name].score(view())
     for blocks in range(1, 6):
         assert np.flatnonzero(pick(scores, blocks)).tolist() == sorted(order[:blocks])
 
 
 def test_drift_plus_penalty_is_algorithm_2():
     age, queue, power = np.array([40, 40, 9, 60]), np.array([0.0, 3.0, 0.0, 7.0]), [0.5, 1, 1, 1.1]
-    known = {key: np.ones(4, int) for key in ("waited", "doubt")}
-    scores = SCHEDULERS["drift-plus-penalty"](
-        View(
+    known = {key: np.ones(4, int) for key in ("waited", "uncertainty")}
+    scores = SCHEDULERS["drift-plus-penalty"].score(
+        SlotView(
             age=age,
             queue=queue,
             power=np.array(power),
@@ -184,11 +131,11 @@ def test_age_value_and_whittle_agree_for_equal_loops(ages, a, blocks, seed):
         queue=none,
         reported=none,
         waited=np.ones(len(ages), int),
-        doubt=np.ones(len(ages)),
+        uncertainty=np.ones(len(ages)),
         growth=geometric(a, 400),
     )
-    by_age = pick(SCHEDULERS["max-aoi"](known), blocks)
-    assert np.array_equal(by_age, pick(SCHEDULERS["whittle"](known), blocks))
+    by_age = pick(SCHEDULERS["max-aoi"].score(known), blocks)
+    assert np.array_equal(by_age, pick(SCHEDULERS["whittle"].score(known), blocks))
     value = np.where(known.able, known.growth.at(known.age), 0.0)  # value of information, myopic
     assert np.array_equal(by_age, pick(value, blocks))
 
@@ -198,4 +145,4 @@ def test_names():
         *("round-robin", "opportunistic", "max-aoi", "drift-plus-penalty", "whittle"),
         "innovation",
     ]
-    assert set(REPORTING) <= set(SCHEDULERS)
+    assert all(SCHEDULERS[name].name == name for name in SCHEDULERS)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from hjepa_cli.core.control.error_growth import Growth
+from hjepa_cli.core.control.error_growth import ErrorGrowthTable
 from hjepa_cli.core.evaluation.cell_simulation import Outbox
 from hjepa_cli.core.radio import uplink as module
 from hjepa_cli.core.radio.fading import block_fading
-from hjepa_cli.core.radio.schedulers import pick
+from hjepa_cli.core.radio.schedulers.scheduler import Scheduler, pick
 from hjepa_cli.core.radio.uplink import Access, Uplink
 
 DEVICES, BLOCKS, MARGIN_DB, SEED = 6, 2, 4.0, 3
@@ -38,10 +38,9 @@ class Books:
 def test_the_books_are_right(round_errors, monkeypatch):
     random, views, slots = np.random.default_rng(0), [], 800
     wishes = random.random((slots, DEVICES))
-    monkeypatch.setattr(
-        module, "SCHEDULERS", {"spy": lambda view: (views.append(view), wishes[len(views) - 1])[1]}
-    )
-    growth = Growth(np.ones(1))
+    spy = Scheduler("spy", lambda view: (views.append(view), wishes[len(views) - 1])[1])
+    monkeypatch.setattr(module, "SCHEDULERS", {"spy": spy})
+    growth = ErrorGrowthTable(np.ones(1))
     access = Access("spy", BLOCKS, MARGIN_DB, -math.inf, 1.0, round_errors, growth, SEED)
     uplink, books, outbox = Uplink(access, DEVICES), Books(len(round_errors)), Outbox()
     turn, queue = np.full(DEVICES, -1), np.zeros(DEVICES)
@@ -100,7 +99,7 @@ def test_embeddings_wait_in_the_outbox_as_they_were_sent():
 
 def test_a_flood_of_reports_does_not_deafen_the_base_station():
     """δ stays where the growth table still sends devices to look; else it could never fall."""
-    growth = Growth(np.full(50, 1e-4))  # nobody is expected to err by more than 0.01
+    growth = ErrorGrowthTable(np.full(50, 1e-4))  # nobody is expected to err by more than 0.01
     access = Access("innovation", 1, 300.0, -math.inf, 1.0, (0.0,), growth, 0)
     uplink = Uplink(access, 40)
     looks = 0

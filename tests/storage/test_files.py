@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -266,3 +267,41 @@ def test_jsonable_turns_undefined_into_null() -> None:
     expected = {"a": 0.5, "b": [1.0, None], "c": [3, "x/y"], "d": None, "e": True, "4": None}
     assert files.jsonable(value) == expected
     json.dumps(files.jsonable(value), allow_nan=False)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
+def test_special_files_are_refused_and_stay(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "out.npz"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as opened:
+            opened.bind(str(path))
+    else:
+        try:
+            os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 3))
+        except PermissionError:
+            path = Path("/dev/null")
+    mode = path.lstat().st_mode
+    (tmp_path / "link").symlink_to(path)
+    for write in (
+        lambda: files.write_bytes(path, b"new"),
+        lambda: files.target(path),
+        lambda: files.target(tmp_path / "link"),
+    ):
+        with pytest.raises(StorageError, match=f"it is a {kind}, not a regular file"):
+            write()
+    assert path.lstat().st_mode == mode and (tmp_path / "link").is_symlink()
+
+
+def test_links_that_a_person_names_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real/file")
+    for data in (b"first", b"second"):
+        files.write_bytes(files.target(tmp_path / "link"), data)
+        assert (tmp_path / "real/file").read_bytes() == data and (tmp_path / "link").is_symlink()
+    (tmp_path / "circle").symlink_to("circle")
+    with pytest.raises(StorageError, match="circle of links"):
+        files.target(tmp_path / "circle")
+    assert files.target(tmp_path / "new" / "file") == tmp_path / "new" / "file"
+    assert (tmp_path / "new").is_dir()

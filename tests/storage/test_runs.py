@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.errors import DataError, LockedError, StorageError, UsageError
+from hjepa_cli.errors import DataError, LockedError, StorageError, Unsealed, UsageError
 from hjepa_cli.storage import runs
 from hjepa_cli.storage.runs import Run, newest_run, read_config, read_result, to_toml
 
@@ -34,6 +34,14 @@ def run_elsewhere(code: str) -> subprocess.CompletedProcess[str]:
         timeout=60,
         check=False,
     )
+
+
+def as_of_schema(number: int, directory: Path) -> None:
+    """Take from a run's records what versions up to this schema had not."""
+    recorded = json.loads((directory / "environment.json").read_text()) | {"schema": number}
+    later = ["settings"] if number == 2 else ["settings", "schema", "inputs"]
+    kept = {key: value for key, value in recorded.items() if key not in later}
+    (directory / "environment.json").write_text(json.dumps(kept))
 
 
 @pytest.fixture(autouse=True)
@@ -294,7 +302,8 @@ def test_what_an_older_version_had_not_is_as_its_preset_says() -> None:
     older = [line for line in lines if not line.startswith(("plant_spread", "bootstrap"))]
     assert len(older) == len(lines) - 2
     config.write_text("".join(older))
-    with Run.create("eval", Path("out"), settings) as run:
+    as_of_schema(2, Path("out"))
+    with pytest.warns(Unsealed), Run.create("eval", Path("out"), settings) as run:
         assert run.resumed
     other = load_settings("smoke", flags={"protocol.bootstrap": 7}).as_dict()
     with pytest.raises(UsageError, match=r"protocol\.bootstrap = \d+, not 7"):
@@ -308,11 +317,9 @@ def test_a_run_of_schema_1_goes_on(tmp_path: Path) -> None:
     """It did not say what it was given: nothing to compare."""
     with Run.create("eval", Path("out"), SETTINGS):
         pass
-    recorded = json.loads(Path("out/environment.json").read_text())
-    del recorded["schema"], recorded["inputs"]
-    Path("out/environment.json").write_text(json.dumps(recorded))
+    as_of_schema(1, Path("out"))
     given = {"dataset": runs.describe_input(tmp_path, "0" * 64)}
-    with Run.create("eval", Path("out"), SETTINGS, given) as run:
+    with pytest.warns(Unsealed), Run.create("eval", Path("out"), SETTINGS, given) as run:
         assert run.resumed
 
 
@@ -339,5 +346,6 @@ def test_runs_of_before_there_was_a_warm_up_are_scored_from_the_start() -> None:
         .replace("steps = 3000", "steps = 900")
     )
     config.write_text(text)
+    as_of_schema(2, Path("old"))
     protocol = runs.load_recorded(None, Path("old")).protocol
     assert (protocol.warmup_steps, protocol.steps) == (0, 900)

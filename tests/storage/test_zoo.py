@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hjepa_cli.config.checks import REFLEXES
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.models import missing_curves, verify
-from hjepa_cli.storage import zoo
+from hjepa_cli.storage import seals, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 
 BEFORE = (  # measured before steady state was the default, as their cards say
@@ -61,8 +61,8 @@ def digest_of(model: Path) -> str:
 
 
 def write_curves(model: Path, digest: str) -> None:
-    text = json.dumps({"schema": 1, "digest": {"checkpoint": digest}, "methods": {}})
-    (model / zoo.CURVES_FILE).write_text(text)
+    document = {"schema": 2, "digest": {"checkpoint": digest}, "methods": {}}
+    (model / zoo.CURVES_FILE).write_text(json.dumps(seals.sealed(document)))
 
 
 def test_only_valid_names_with_a_model_are_listed(models: Path) -> None:
@@ -155,14 +155,14 @@ def test_verify_says_which_curves_are_not_those_of_the_defaults(
     shipped = zoo.zoo_directory() / "desktop-h4m2l1"
     model = Path(shutil.copytree(shipped, tmp_path / "model"))
     curves = json.loads((model / zoo.CURVES_FILE).read_text())
-    methods = [name for name in load_settings().methods if name not in REFLEXES]
+    methods = [name for name in load_settings().methods if not METHODS[name].reflex]
     for change, missing in (
         ({}, []),
         ({"methods": {k: v for k, v in curves["methods"].items() if k != "hold"}}, ["hold"]),
         ({"digest": curves["digest"] | {"protocol": "0" * 64}}, methods),
         ({"digest": curves["digest"] | {"loop_version": 0}}, methods),
     ):
-        (model / zoo.CURVES_FILE).write_text(json.dumps(curves | change))
+        (model / zoo.CURVES_FILE).write_text(json.dumps(seals.sealed(curves | change)))
         (verified,) = verify(Screen(), [str(model)])["verified"]
         assert verified["missing_curves"] == missing
         said = capsys.readouterr().out

@@ -11,22 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from hjepa_cli.config.settings import Settings, load_settings
-from hjepa_cli.core.control.methods import build_method
-from hjepa_cli.core.networks.decoder import Decoder
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver, methods_of
+from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import Model, build_modules
-from hjepa_cli.core.networks.read_frames import read_frames
 from hjepa_cli.core.networks.symmetry import flatten_twins, reflect, unflatten_twins
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
 from hjepa_cli.core.training.batches import FrameWindows, TrajectoryBatch
 from hjepa_cli.core.training.frame_policies import Imitation
 from hjepa_cli.core.training.optimiser import Optimiser
+from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
 from hjepa_cli.errors import DataError, Interrupted, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import baselines, collect, resume, train_encoder, train_hierarchy
-from hjepa_cli.stages.frame_training import standardisation_sample
-from hjepa_cli.stages.inputs import RenderedSplit
 
 QUIET = Screen(quiet=True)
 TINY = {
@@ -212,7 +211,7 @@ def test_a_decoder_that_paints_its_target_is_read_as_the_frames_themselves(
 def test_a_baseline_is_one_complete_checkpoint(name: str, workplace: Path) -> None:
     model = Model.load(workplace / name / "model.safetensors", "cpu")
     kappa = int(name[-1])
-    assert model.methods == (name,) and model.frames == kappa
+    assert methods_of(model) == (name,) and model.frames == kappa
     assert model.metadata["health"]["action_sensitivity"] is None
     rows = list(csv.DictReader((workplace / name / "metrics.csv").read_text().splitlines()))
     expected = {"force"} | ({"reconstruction"} if name == "autoencoder-2" else set())
@@ -302,7 +301,7 @@ def test_raw_frames_are_sent_whatever_the_payload(name: str, workplace: Path) ->
     model = Model.load(workplace / name / "model.safetensors", "cpu")
     kappa = int(name[-1])
     for payload in ("int8", "pca-4x4"):
-        method = build_method(name, settings(protocol__payload=payload), model)
+        method = build_driver(name, settings(protocol__payload=payload), model)
         assert method.bits_per_transmission == kappa * 64 * 128 * 3 * 8
     states = 0.02 * np.random.default_rng(0).normal(size=(3, 4, 4))
     frames = method.sensor(states)
@@ -313,8 +312,8 @@ def test_raw_frames_are_sent_whatever_the_payload(name: str, workplace: Path) ->
     everybody = np.ones(3, dtype=bool)
     assert controller.act(everybody, frames) == pytest.approx(expected, abs=1e-4)
     assert controller.act(~everybody, None) == pytest.approx(expected, abs=1e-4)  # held
-    late = build_method(f"{name}+3", settings(), model)
+    late = build_driver(f"{name}+3", settings(), model)
     assert late.delay_steps == 3 and late.family != method.family
     assert late.name == f"{name}+3"  # by which its loops are driven
     with pytest.raises(UsageError, match="needs a model of it"):
-        build_method("hjepa", settings(), model)
+        build_driver("hjepa", settings(), model)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from hjepa_cli.core.training.ema import EmaTarget
+from hjepa_cli.core.training.jepa import EmaTarget
 
 
 def network() -> nn.Module:

@@ -29,12 +29,12 @@ from hjepa_cli.cli.app import main
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import build_modules, tensors_of
-from hjepa_cli.core.training import shared_norm
+from hjepa_cli.core.training import progress, shared_norm
 from hjepa_cli.core.training.jepa import Jepa
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.ranks import Ranks, joined
 from hjepa_cli.core.training.shared_norm import SharedBatchNorm, share_statistics
-from hjepa_cli.stages import collect, progress, train_encoder
+from hjepa_cli.stages import collect, train_encoder
 from hjepa_cli.storage import runs
 from hjepa_cli.storage.checkpoints import Checkpoint, load_checkpoint
 
@@ -192,7 +192,8 @@ LAST_THREADS = """
 import atexit, os, pathlib
 
 def tell():
-    names = [task.joinpath("comm").read_text() for task in pathlib.Path("/proc/self/task").iterdir()]
+    tasks = pathlib.Path("/proc/self/task").iterdir()
+    names = [task.joinpath("comm").read_text() for task in tasks]
     pathlib.Path("threads-" + os.environ["RANK"]).write_text("".join(names))
 
 if "RANK" in os.environ and os.path.exists("/proc/self/task"):
@@ -317,8 +318,8 @@ def without_state(rank: int) -> None:
 
 
 def test_batch_norm_of_several_processes_is_that_of_one() -> None:
-    context, port = multiprocessing.get_context("forkserver"), free_port()
-    children = [context.Process(target=check_batch_norm, args=(rank, 2, port)) for rank in range(2)]
+    context, ports = multiprocessing.get_context("forkserver"), [free_port() for _ in range(4)]
+    children = [context.Process(target=check_batch_norm, args=(rank, ports)) for rank in range(2)]
     for child in children:
         child.start()
     for child in children:
@@ -326,9 +327,11 @@ def test_batch_norm_of_several_processes_is_that_of_one() -> None:
     assert [child.exitcode for child in children] == [0, 0]
 
 
-def check_batch_norm(rank: int, size: int, port: int) -> None:
-    """Values, gradients and running statistics against torch's own, on unequal shares."""
-    os.environ |= environment(rank, size, port)
+def check_batch_norm(rank: int, ports: list[int]) -> None:
+    """Values, gradients and running statistics against torch's own, on unequal shares.
+
+    Every meeting has a port of its own: whoever is early would meet at the one before.
+    """
     torch.set_num_threads(1)
     torch.manual_seed(0)
     for kind, shape in ((torch.nn.BatchNorm2d, (7, 3, 4, 5)), (torch.nn.BatchNorm1d, (7, 3))):
@@ -344,6 +347,7 @@ def check_batch_norm(rank: int, size: int, port: int) -> None:
             full = x.clone().requires_grad_()
             y = whole(full)
             (y * weights).sum().backward()
+            os.environ |= environment(rank, 2, ports.pop())
             with joined(torch.device("cpu"), 7) as ranks:
                 rows = ranks.share(7)
                 part = x[rows].clone().requires_grad_()

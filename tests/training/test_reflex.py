@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 from command_line import Shell, assert_one_line_error, open_shell
+from played import play
 
-from hjepa_cli.config.checks import REFLEXES
-from hjepa_cli.config.settings import Settings, load_settings
-from hjepa_cli.core.control.controllers import Oracle
-from hjepa_cli.core.control.loop import Draws, every_step, gap_schedule, play, simulate
-from hjepa_cli.core.control.methods import build_method
-from hjepa_cli.core.control.reflex_controllers import DecayingHold, ReflexController
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.controllers import LastForce, Oracle, ReflexController
+from hjepa_cli.core.control.drivers import build_driver, methods_of
+from hjepa_cli.core.control.loop import Draws, every_step, gap_schedule, simulate
 from hjepa_cli.core.control.sensors import true_state
 from hjepa_cli.core.networks.model import Model, build_modules, tensors_of
 from hjepa_cli.core.networks.reflex import Reflex
@@ -28,10 +28,11 @@ from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training import decay_fit, reflex_training
 from hjepa_cli.core.training.decay_fit import Trial
 from hjepa_cli.core.training.optimiser import Optimiser
+from hjepa_cli.core.training.progress import PROGRESS_FILE
 from hjepa_cli.errors import DataError, Interrupted
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import collect, resume, train_encoder, train_hierarchy, train_reflex
-from hjepa_cli.stages.progress import PROGRESS_FILE
 from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 
@@ -135,8 +136,11 @@ def test_a_force_that_fades_needs_no_predictor() -> None:
     options = dataclasses.replace(load_settings(flags={"protocol": "paper"}).protocol, steps=steps)
     draws = Draws.make(options, devices, seed=0)
     law_n = np.array([22.8, 10.2, 58.6, 5.5])
-    fading = DecayingHold(
-        lambda states: (law_n * states).sum(-1), 1.0, 8.6, kind.force_limit_n, 3 * devices
+    fading = LastForce(
+        lambda states: (law_n * states).sum(-1),
+        3 * devices,
+        tau_steps=8.6,
+        force_limit_n=kind.force_limit_n,
     )
     schedules = np.stack([gap_schedule(gap, steps, devices) for gap in gaps])
     found = simulate(kind, draws, schedules, fading, true_state).score.mean(axis=1)
@@ -156,14 +160,16 @@ def deliveries(steps: int, devices: int) -> np.ndarray:
 def test_a_decaying_hold_against_its_formula(shape: tuple[int, ...]) -> None:
     random, devices, tau = np.random.default_rng(0), 4, np.array([2.0, 5.0, 5.0, 30.0])
     gain = np.array([1.0, 0.5, 4.0, 1.0])
-    controller = DecayingHold(lambda x: x, gain, tau, 3.0, devices, action_shape=shape)
+    controller = LastForce(
+        lambda x: x, devices, gain=gain, tau_steps=tau, force_limit_n=3.0, action_shape=shape
+    )
     fresh, age = np.zeros((devices, *shape)), np.zeros(devices)
     for delivered in deliveries(40, devices):
         packets = random.normal(size=(delivered.sum(), *shape))
         assert not delivered.any() or np.abs(packets).max() > 0
         age += 1
         fresh[delivered], age[delivered] = packets, 0
-        ahead = controller.outlook()
+        ahead = controller.planned_n()
         played = controller.act(delivered, packets if delivered.any() else None)
         np.testing.assert_array_equal(played[~delivered], ahead[~delivered])
         factor = (gain * np.exp(-age / tau)).reshape(-1, *[1] * len(shape))
@@ -207,7 +213,7 @@ def test_a_reflex_is_played_as_it_is_asked(
         z = torch.randn(int(delivered.sum()), 8)
         for row, device in enumerate(np.flatnonzero(delivered)):
             last[device], since[device] = z[row], []
-        asked, ahead = reaction.asked, controller.outlook()
+        asked, ahead = reaction.asked, controller.planned_n()
         played = controller.act(delivered, z if delivered.any() else None)
         np.testing.assert_array_equal(played[~delivered], ahead[~delivered])
         assert reaction.asked - asked <= devices + delivered.sum()
@@ -276,16 +282,16 @@ def test_plans_with_exploration_answer_the_state_that_the_pushes_lead_to() -> No
 def test_a_loss_asks_for_the_right_forces_and_sees_the_past_alone() -> None:
     network = reflex(sees_forces=True, forces_at_once=1)
     z, forces = torch.randn(3, 8), torch.randn(3, 9)
-    drawn = reflex_training.Drawn(torch.tensor([2, 0]), torch.tensor([[4, 1], [7, 0]]))
+    drawn = torch.tensor([2, 0]), torch.tensor([[4, 1], [7, 0]])
 
     def loss(sent: torch.Tensor) -> float:
         plans = reflex_training.Plans(forces, sent)
-        return reflex_training.reflex_loss(network, z, plans, drawn).item()
+        return reflex_training.reflex_loss(network, z, plans, *drawn).item()
 
     sent = torch.randn(3, 9)
     past = torch.zeros(2, 2, 7)
     past[0, 0, :4], past[0, 1, :1], past[1, 0] = sent[2, :4], sent[2, :1], sent[0, :7]
-    answer = network(z[[2, 0]], drawn.ages, past)[..., 0]
+    answer = network(z[[2, 0]], drawn[1], past)[..., 0]
     labels = torch.stack([forces[2, [4, 1]], forces[0, [7, 0]]])
     expected = (answer - labels).square().mean()
     assert loss(sent) == pytest.approx(expected.item(), rel=1e-5)
@@ -332,7 +338,9 @@ def test_searches_move_devices_as_the_loop_does(name: str) -> None:
 
         loops = 3 * len(trial.gaps)
         shape = kind.action_shape
-        fading = DecayingHold(act, 1.0, tau, kind.force_limit_n, loops, action_shape=shape)
+        fading = LastForce(
+            act, loops, tau_steps=tau, force_limit_n=kind.force_limit_n, action_shape=shape
+        )
         shares = trial.shares(fading, true_state)
         rows = slice(number * len(trial.gaps), (number + 1) * len(trial.gaps))
         np.testing.assert_allclose(found[rows], shares, atol=1.5 / 60)
@@ -360,7 +368,7 @@ def test_a_run_says_what_it_found_and_repeats_to_the_last_bit(
     said = first.metadata["reflex"]
     assert np.shape(said["law"]["gains_n"]) == (1, 4) and said["tau_steps"] > 0
     assert said["fitted"]["seed"] == decay_fit.SEARCH_SEED
-    assert result["nmae_windows"].keys() == set(REFLEXES)
+    assert result["nmae_windows"].keys() == {name for name in METHODS if METHODS[name].reflex}
     rows = (workplace / "run" / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["level", "chunk", "chunk_forces"]
 
@@ -400,12 +408,12 @@ def test_two_forces_and_six_states_train_and_play(tmp_path: Path) -> None:
     options = settings("quadrotor")
     prepare(tmp_path, options)
     model = Model.load(Path(train(tmp_path, tmp_path / "run", options)["checkpoint"]), "cpu")
-    assert model.methods == REFLEXES
+    assert methods_of(model) == tuple(name for name in METHODS if METHODS[name].reflex)
     assert np.shape(model.metadata["reflex"]["law"]["gains_n"]) == (2, 6)
     draws = Draws.make(options.protocol, 3, seed=0)
     schedule = gap_schedule(5, draws.steps, 3)[None]
-    for name in REFLEXES:
-        method = build_method(name, options, model)
+    for name in methods_of(model):
+        method = build_driver(name, options, model)
         forces: list[np.ndarray] = []
         simulate(
             plant("quadrotor"),
@@ -424,7 +432,7 @@ def test_a_method_that_fades_is_the_actor_times_its_decay(workplace: Path) -> No
     z = torch.randn(3, 16)
     for name, actor in (("hold-decay", model.actor), ("hold-decay-linear", model.law)):
         decay = model.decays[name]
-        played = play(build_method(name, settings(), model).controller(3), z, 3, 9)
+        played = play(build_driver(name, settings(), model).controller(3), z, 3, 9)
         with torch.inference_mode():
             fresh_n = actor(z).numpy().astype(float)
         factors = decay.gain * np.exp(-np.arange(9) / decay.tau_steps)
@@ -476,7 +484,7 @@ def test_a_hierarchy_can_be_trained_on_its_encoder(workplace: Path, tmp_path: Pa
         out=tmp_path / "hierarchy",
     )
     model = Model.load(Path(result["checkpoint"]), "cpu")
-    assert "hjepa" in model.methods and "longest_age" not in model.architecture
+    assert "hjepa" in methods_of(model) and "longest_age" not in model.architecture
 
 
 @pytest.fixture

@@ -19,18 +19,28 @@ import torch
 from command_line import ENVIRONMENT, Shell, assert_one_line_error, open_shell
 
 from hjepa_cli.compute.interrupts import Postponed, Terminated, sigterm_raises
-from hjepa_cli.config.settings import Settings, load_settings
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.training import progress
 from hjepa_cli.core.training.batches import FrameWindows, TrajectoryBatch
 from hjepa_cli.core.training.jepa import Jepa
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser
+from hjepa_cli.core.training.progress import PROGRESS_FILE
 from hjepa_cli.core.training.ranks import Ranks
 from hjepa_cli.errors import DataError, Interrupted, NumericalError, StorageError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import collect, progress, resume, train_encoder, train_hierarchy
-from hjepa_cli.stages.progress import PROGRESS_FILE
+from hjepa_cli.stages import (
+    collect,
+    embedding_training,
+    evaluate,
+    resume,
+    train_encoder,
+    train_hierarchy,
+)
 from hjepa_cli.storage import runs
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
+from hjepa_cli.storage.files import jsonable
 
 QUIET = Screen(quiet=True)
 TINY = {
@@ -122,7 +132,7 @@ def crash_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
 
 def skip_actor(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fit no actor with the counted optimiser: only steps of the loops count."""
-    for module in (train_encoder, train_hierarchy):
+    for module in (train_encoder, embedding_training):
         fit = module.fit_actor
 
         def uncounted(*args: Any, fit: Any = fit, **options: Any) -> Any:
@@ -217,7 +227,7 @@ def test_each_part_of_the_state_matters(
                 save_checkpoint(out / PROGRESS_FILE, kept, saved.metadata)
             elif forgotten == "stream":
                 other = np.random.Generator(np.random.Philox(1)).bit_generator.state
-                changed = saved.metadata | {"stream": progress._plain(other)}
+                changed = saved.metadata | {"stream": jsonable(other)}
                 save_checkpoint(out / PROGRESS_FILE, kept, changed)
             else:
                 kept = {name: v for name, v in kept.items() if not name.startswith(forgotten)}
@@ -232,6 +242,28 @@ def test_each_part_of_the_state_matters(
             trainer("train-encoder", workplace)(out)
         model = out / "model.safetensors"
         assert model.read_bytes() != (workplace / "train-encoder" / model.name).read_bytes()
+
+
+def test_a_state_goes_on_under_its_own_settings_only(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a model of both settings would claim the second."""
+    out, config, environment = (
+        tmp_path / name for name in ("run", "run/config.toml", "run/environment.json")
+    )
+    with monkeypatch.context() as patched:
+        signal_after(patched, 3)
+        with pytest.raises(Interrupted):
+            trainer("train-encoder", workplace)(out)
+    config.write_text(config.read_text().replace("seed = 0\n", "seed = 8\n"))
+    with pytest.raises(DataError, match=r"config\.toml was changed .*: seed = 0, not 8"):
+        resume.run(out, QUIET)
+    recorded = json.loads(environment.read_text())
+    assert recorded["settings"].pop("seed") == 0
+    recorded["settings"]["seed"] = 8
+    environment.write_text(json.dumps(recorded))  # one who changes both has the state against him
+    with pytest.raises(DataError, match=rf"{PROGRESS_FILE} .*other settings: seed = 0, not 8"):
+        resume.run(out, QUIET)
 
 
 def test_the_optimiser_keeps_its_memory_layout() -> None:
@@ -579,7 +611,8 @@ STAGES = ("train-encoder", "train-hierarchy", "eval", "scale", "reproduce")
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_dry_run_says_what_is_taken_up_and_takes_up_nothing(hjepa: Shell, stage: str) -> None:
     settings = load_settings("smoke", flags={"seed": 3})
-    inputs = {"dataset": None, "checkpoint": None, "remeasure": False}
+    models = evaluate.open_measurable(settings, QUIET, None, None)
+    inputs = {"dataset": None, **models.inputs(remeasure=False)}
     with runs.Run.create(stage, Path("r"), settings.as_dict(), inputs):
         pass
     with hjepa.untouched():
@@ -605,7 +638,8 @@ def test_what_cannot_be_resumed(hjepa: Shell) -> None:
     (run / "config.toml").write_text("")
     for text, code, message in (
         ("{", 65, "not valid JSON"),
-        ('{"schema": 3, "stage": "eval", "inputs": {}}', 65, "reads up to 2"),
+        ('{"schema": 4, "stage": "eval", "inputs": {}}', 65, "reads up to 3"),
+        ('{"schema": 3, "stage": "eval", "inputs": {}}', 65, "malformed"),
         ('{"schema": 2, "stage": "eval", "inputs": []}', 65, "malformed"),
         ('{"schema": 2, "stage": "eval", "inputs": {}, "preset": 3}', 65, "preset"),
         ('{"schema": 2, "stage": "dance", "inputs": {}}', 65, "'dance'"),
@@ -621,13 +655,15 @@ def test_a_run_of_another_version_says_so(hjepa: Shell) -> None:
     Path("r/result.json").unlink()
     environment = json.loads(Path("r/environment.json").read_text())
     environment["versions"]["hjepa"] = "9.8.7"
-    Path("r/environment.json").write_text(json.dumps(environment))
+    theirs = environment["settings"] | {"quantum": {"leap": 1}}
+    Path("r/environment.json").write_text(json.dumps(environment | {"settings": theirs}))
     known = Path("r/config.toml").read_text()
     Path("r/config.toml").write_text(known + "\n[quantum]\nleap = 1\n")
     with hjepa.untouched():
         outcome = hjepa("resume", "r")
     assert_one_line_error(outcome, 2, "made by hjepa 9.8.7", "quantum", "hjepa eval --out DIR")
     Path("r/config.toml").write_text(known)
+    Path("r/environment.json").write_text(json.dumps(environment))
     outcome = hjepa("resume", "r")
     assert outcome.code == 0 and "begun by hjepa 9.8.7" in outcome.err
 

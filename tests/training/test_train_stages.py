@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from hjepa_cli.config.checks import ANCHORS
-from hjepa_cli.config.settings import Settings, load_settings
-from hjepa_cli.core.control.methods import build_method
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver, methods_of, planner_of
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.networks.symmetry import reflect
 from hjepa_cli.errors import DataError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import collect, train_encoder, train_hierarchy
+from hjepa_cli.plugins import METHODS
+from hjepa_cli.stages import collect, embedding_training, train_encoder, train_hierarchy
 from hjepa_cli.stages.train_hierarchy import open_encoder
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
@@ -36,6 +37,8 @@ TINY = {
     "hierarchy.medium_steps": 2,
     "hierarchy.low_steps": 2,
 }
+
+FITTED = [*(name for name in METHODS if METHODS[name].fitted), "local"]
 
 
 def settings(**changes: object) -> Settings:
@@ -119,7 +122,7 @@ def test_the_hierarchy_takes_the_encoder_as_it_is(workplace: Path) -> None:
     taken = networks(workplace / "hierarchy")["encoder"].state_dict()
     for name, tensor in source["encoder"].state_dict().items():
         assert torch.equal(taken[name], tensor), name
-    assert model.methods == ("hjepa", "ts-jepa-4", "ts-jepa-1", "hold", "zero", *ANCHORS)
+    assert methods_of(model) == ("hjepa", "ts-jepa-4", "ts-jepa-1", "hold", "zero", *FITTED)
     with (workplace / "hierarchy" / "metrics.csv").open() as lines:
         assert {row["level"] for row in csv.DictReader(lines)} == {"high", "medium", "low", "flat"}
 
@@ -134,27 +137,27 @@ def test_other_strides_train_and_play(workplace: Path, h: int, m: int, l: int) -
     model = train(workplace, f"strides-{h}-{m}-{l}", hierarchy__h=h, hierarchy__m=m, hierarchy__l=l)
     z = model.encode(np.zeros((3, 2, 64, 128, 3), np.uint8))
     for method in ("hjepa", f"ts-jepa-{h}", "ts-jepa-1"):
-        planner = model.planner(method)
+        planner = planner_of(model, method)
         with torch.inference_mode():
             forces_n, z_next = planner.plan(z)
         assert forces_n.shape == (3, planner.stride) and z_next.shape == z.shape
         assert (forces_n.abs() <= 20.0).all()
-    assert model.planner("hjepa").stride == h
+    assert planner_of(model, "hjepa").stride == h
 
 
 @pytest.mark.parametrize("h", [1, 2, 4])
 def test_one_level_is_ts_jepa_of_that_depth(workplace: Path, h: int) -> None:
     model = train(workplace, f"flat-{h}", hierarchy__h=h, hierarchy__m=h, hierarchy__l=h)
     planned = dict.fromkeys((f"ts-jepa-{h}", "ts-jepa-1"))
-    assert model.methods == (*planned, "hold", "zero", *ANCHORS)
+    assert methods_of(model) == (*planned, "hold", "zero", *FITTED)
     names = {name.partition(".")[0] for name in model.networks.state_dict()}
     assert names == {"encoder", "actor", "flat"} | ({"high"} if h > 1 else set())
     z = model.encode(np.zeros((3, 2, 64, 128, 3), np.uint8))
     with torch.inference_mode():
-        forces_n, _ = model.planner(f"ts-jepa-{h}").plan(z)
+        forces_n, _ = planner_of(model, f"ts-jepa-{h}").plan(z)
     assert forces_n.shape == (3, h)
     with pytest.raises(UsageError, match="no planner 'hjepa'"):
-        model.planner("hjepa")
+        planner_of(model, "hjepa")
 
 
 def test_the_companion_is_the_start_of_the_high_level_where_h_agrees(workplace: Path) -> None:
@@ -270,13 +273,13 @@ def test_frames_are_flipped_for_encoders_that_were_trained_so(workplace: Path, m
     flipped = settings(encoder__mirror="augment")
     train_encoder.run(flipped, QUIET, dataset=workplace / "data", out=workplace / "flipped-encoder")
     seen: list[tuple[torch.Tensor, torch.Tensor]] = []
-    fit = train_hierarchy.fit_actor
+    fit = embedding_training.fit_actor
 
     def spy(z, labels, *rest, **options):
         seen.append((z, labels))
         return fit(z, labels, *rest, **options)
 
-    monkeypatch.setattr(train_hierarchy, "fit_actor", spy)
+    monkeypatch.setattr(embedding_training, "fit_actor", spy)
     symmetric = train(workplace, "plain")
     flipped = train(workplace, "mirrored", "flipped-encoder")
     (plain_z, plain), (both_z, both) = seen
@@ -298,8 +301,8 @@ def test_a_trained_model_treats_both_sides_alike(workplace: Path) -> None:
     torch.testing.assert_close(of_mirror, reflect(z), atol=0.05, rtol=0)  # bfloat16
     for name in ("hjepa", "ts-jepa-1", "ts-jepa-4"):
         with torch.inference_mode():
-            forces_n, ahead = model.planner(name).plan(z)
-            of_mirror_n, of_mirror_ahead = model.planner(name).plan(reflect(z))
+            forces_n, ahead = planner_of(model, name).plan(z)
+            of_mirror_n, of_mirror_ahead = planner_of(model, name).plan(reflect(z))
         torch.testing.assert_close(of_mirror_n, -forces_n, atol=0.02, rtol=0)
         torch.testing.assert_close(of_mirror_ahead, reflect(ahead), atol=0.02, rtol=0)
 
@@ -327,5 +330,5 @@ def test_true_states_are_charged_the_bits_of_the_model_s_embeddings(workplace: P
     train_hierarchy.run(small, QUIET, dataset=workplace / "data", encoder=str(encoder), out=levels)
     model = Model.load(levels / "model.safetensors", "cpu")
     for method in ("hjepa", "hold-true", "oracle"):
-        assert build_method(method, settings(), model).bits_per_transmission == 64 * 8 + 16
-    assert build_method("oracle", settings(), None).bits_per_transmission == 256 * 8 + 16
+        assert build_driver(method, settings(), model).bits_per_transmission == 64 * 8 + 16
+    assert build_driver("oracle", settings(), None).bits_per_transmission == 256 * 8 + 16

@@ -167,16 +167,16 @@ def test_the_rollout_loss_is_differentiable_from_end_to_start() -> None:
 def predictor(**changes: object) -> Predictor:
     """A predictor whose output is all network: no residual path could stand in for an input."""
     torch.manual_seed(3)
-    options = {"anchored": True, "distances": 4, "residual": False} | changes
+    options = {"guided": True, "distances": 4, "residual": False} | changes
     return Predictor(6, 32, 3, **options).eval()  # type: ignore[arg-type]
 
 
 def inputs() -> dict[str, Tensor]:
     torch.manual_seed(4)
-    return {"z": torch.randn(5, 6), "actions": torch.rand(5, 3), "anchor": torch.randn(5, 6)}
+    return {"z": torch.randn(5, 6), "actions": torch.rand(5, 3), "waypoint": torch.randn(5, 6)}
 
 
-@pytest.mark.parametrize("name", ["z", "actions", "anchor"])
+@pytest.mark.parametrize("name", ["z", "actions", "waypoint"])
 def test_every_value_of_every_input_reaches_the_network(name: str) -> None:
     network, given = predictor(), inputs()
     before = network(**given, remaining=3)
@@ -200,10 +200,10 @@ def test_the_remaining_distance_reaches_the_network_where_it_varies() -> None:
 def test_an_untrained_residual_predictor_walks_straight_to_its_anchor(remaining: int) -> None:
     given = inputs()
     walked = predictor(residual=True)(**given, remaining=remaining)
-    point = given["z"] + (given["anchor"] - given["z"]) / remaining
+    point = given["z"] + (given["waypoint"] - given["z"]) / remaining
     expected = math.sqrt(6) * point / point.norm(dim=-1, keepdim=True)
     torch.testing.assert_close(walked, expected)
-    alone = predictor(residual=True, anchored=False, distances=1)
+    alone = predictor(residual=True, guided=False, distances=1)
     stays = alone(given["z"], given["actions"])
     cosine = torch.cosine_similarity(stays, given["z"], dim=-1)
     torch.testing.assert_close(cosine, torch.ones(5))
@@ -279,13 +279,13 @@ class Drift:
     def __init__(self, stride: int, error: float = 0.0) -> None:
         self.change = torch.tensor([error, float(stride)])
         self.seen: list[Tensor] = []
-        self.anchors: list[Tensor | None] = []
+        self.waypoints: list[Tensor | None] = []
 
     def __call__(
-        self, z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        self, z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor:
         self.seen.append(z)
-        self.anchors.append(anchor)
+        self.waypoints.append(waypoint)
         return z + self.change
 
 
@@ -369,8 +369,8 @@ def test_finer_levels_are_given_the_coarser_level_s_predictions_as_anchors() -> 
         **common,  # type: ignore[arg-type]
     )
     assert rollout_error(medium.seen[0]).tolist() == [0.0, 0.5] * 6
-    assert medium.anchors[0] is not None
-    assert rollout_error(medium.anchors[0]).tolist() == [0.5, 0.0] * 6  # 2 × 0.5: a whole number
+    assert medium.waypoints[0] is not None
+    assert rollout_error(medium.waypoints[0]).tolist() == [0.5, 0.0] * 6  # 2 × 0.5: a whole number
     low = Drift(1)
     low_loss(
         low,
@@ -384,8 +384,8 @@ def test_finer_levels_are_given_the_coarser_level_s_predictions_as_anchors() -> 
         **common,  # type: ignore[arg-type]
     )
     assert rollout_error(low.seen[0]).tolist() == [0.0, 0.25, 0.5, 0.75] * 6
-    assert low.anchors[0] is not None
-    assert rollout_error(low.anchors[0]).tolist() == [0.25, 0.5, 0.75, 0.0] * 6
+    assert low.waypoints[0] is not None
+    assert rollout_error(low.waypoints[0]).tolist() == [0.25, 0.5, 0.75, 0.0] * 6
 
 
 # ---- windows ---------------------------------------------------------------------------------

@@ -1,1 +1,1 @@
-"""The closed loop: what devices send, and what a controller makes of it."""
+"""The closed loop is what devices send and what a controller makes of it."""

@@ -1,4 +1,4 @@
-"""What sits in the cloud: controllers that turn packets into forces.
+"""Controllers sit in the cloud and turn packets into forces.
 
 Nothing here can reach a plant: a controller is built from functions of what it received (a
 planner, an actor, the equations of motion), never from the simulator that it drives.
@@ -12,88 +12,133 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats
-from hjepa_cli.core.networks.planning import Planner
+from hjepa_cli.core.networks.planning import Planner, Reaction
 
 
-class StrideController:
-    """Plays a planner: one stride at a time, a packet starts a new stride at once.
+class _Strides:
+    """Plays some steps of forces at a time; a packet starts a device anew at once."""
 
-    Args:
-        planner: see :class:`Planner`.
-        devices: n.
-        action_shape: A, of the plant.
-    """
+    def __init__(self, stride: int, devices: int, action_shape: tuple[int, ...]) -> None:
+        self._stride = stride
+        self._z = torch.zeros(devices, 0)  # takes its width from the first packets
+        self._forces_n = torch.zeros(devices, stride, *action_shape)
+        self._phase = np.full(devices, stride)
+        self._heard = np.zeros(devices, dtype=bool)
+
+    @torch.inference_mode()
+    def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
+        """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
+
+        A device that has not been heard yet gets 0 N.
+        """
+        if packets is not None:
+            if not self._z.shape[1]:
+                self._z = packets.new_zeros(len(delivered), packets.shape[1])
+            self._z[torch.from_numpy(delivered)] = packets
+            self._heard |= delivered
+        played = self._play(delivered | self._over)
+        self._phase[self._heard] += 1
+        return played
+
+    @torch.inference_mode()
+    def planned_n(self) -> Floats:
+        """Return the forces [n, *A] of the coming step if no packet comes.
+
+        ``act`` then plans only for those who do get a packet.
+        """
+        return self._play(self._over)
+
+    def _plan(self, due: Bools) -> Tensor:
+        """Return forces_n [due.sum(), stride, *A] from the embeddings of those who are due."""
+        raise NotImplementedError
+
+    @property
+    def _over(self) -> Bools:
+        return np.asarray(self._heard & (self._phase == self._stride))
+
+    def _play(self, due: Bools) -> Floats:
+        """Plan for those who are due, and return everybody's force of this step."""
+        if due.any():
+            self._forces_n[torch.from_numpy(due)] = self._plan(due).float().cpu()
+            self._phase[due] = 0
+        at = np.minimum(self._phase, self._stride - 1)  # 0 N of those not heard yet
+        return np.asarray(self._forces_n.numpy()[np.arange(len(due)), at], dtype=np.float64)
+
+
+class StrideController(_Strides):
+    """Plays a planner for n devices: a stride starts where the last one led to, or at a packet."""
 
     def __init__(
         self, planner: Planner, devices: int, *, action_shape: tuple[int, ...] = ()
     ) -> None:
-        self._planner = planner
-        self._forces_n = torch.zeros(devices, planner.stride, *action_shape)
-        self._anchors = torch.zeros(devices, 0)  # takes its width from the first packets
-        self._starts = self._anchors
-        self._phase = np.full(devices, planner.stride)
+        super().__init__(planner.stride, devices, action_shape)
+        self._planner, self._starts = planner, self._z
 
-    @torch.inference_mode()
-    def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
-        """Forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
-
-        The first packets must be of every device; until they come, no force is played.
-        """
-        if packets is None and not self._anchors.shape[1]:
-            return np.zeros((len(delivered), *self._forces_n.shape[2:]))
-        if packets is not None:
-            if not self._anchors.shape[1]:
-                self._anchors = packets.new_zeros(len(delivered), packets.shape[1])
-                self._starts = self._anchors.clone()
-            self._anchors[torch.from_numpy(delivered)] = packets
-        played = self._plan(delivered | (self._phase == self._planner.stride))
-        self._phase += 1
-        return played
-
-    @torch.inference_mode()
-    def outlook(self) -> Floats:
-        """Forces [n, *A] of the coming step if no packet comes; from the second step on.
-
-        ``act`` then plans only for those who do get a packet.
-        """
-        return self._plan(self._phase == self._planner.stride)
-
-    def _plan(self, due: Bools) -> Floats:
-        """Plan a stride for those who are due, and return everybody's force of this step."""
-        if due.any():
-            rows = torch.from_numpy(np.flatnonzero(due))
-            self._starts[rows] = self._anchors[rows]
-            forces_n, self._anchors[rows] = self._planner.plan(self._anchors[rows])
-            self._forces_n[rows] = forces_n.float().cpu()
-            self._phase[due] = 0
-        played = self._forces_n.numpy()[np.arange(len(due)), self._phase]
-        return np.asarray(played, dtype=np.float64)
+    def _plan(self, due: Bools) -> Tensor:
+        if not self._starts.shape[1]:
+            self._starts = torch.zeros_like(self._z)
+        rows = torch.from_numpy(np.flatnonzero(due))
+        self._starts[rows] = self._z[rows]
+        forces_n, self._z[rows] = self._planner.plan(self._z[rows])
+        return forces_n
 
     @property
     def reached(self) -> tuple[Bools, Tensor]:
-        """Whose stride is over [n], and the embeddings [n, D] that the strides lead to."""
-        return self._phase == self._planner.stride, self._anchors
+        """Return whose stride is over [n], and the embeddings [n, D] that strides lead to."""
+        return self._phase == self._stride, self._z
 
     @property
     def belief(self) -> tuple[Tensor, Tensor, Floats]:
-        """Where the controller takes its devices to be, at the step it acted on last.
+        """Return the embeddings that the controller takes its devices to be at, at its last step.
 
         Returns:
             The embeddings [n, D] that the current strides started from, those [n, D] that they
             lead to, and the share of each stride that is over [n], 0 where one has just started.
         """
-        return self._starts, self._anchors, (self._phase - 1) / self._planner.stride
+        return self._starts, self._z, (self._phase - 1) / self._stride
+
+
+class ReflexController(_Strides):
+    """Plays a reaction for n devices, to the last packet, its age and the forces since."""
+
+    def __init__(
+        self, reaction: Reaction, devices: int, *, action_shape: tuple[int, ...] = ()
+    ) -> None:
+        super().__init__(reaction.stride, devices, action_shape)
+        self._reaction = reaction
+        self._sent_n = torch.zeros(devices, reaction.remembers, *action_shape)
+        self._ages = np.zeros(devices, dtype=np.int64)
+
+    def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
+        """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D]."""
+        if packets is not None:
+            self._sent_n[torch.from_numpy(delivered)] = 0.0
+            self._ages[delivered] = 0
+        played = super().act(delivered, packets)
+        remembered = np.flatnonzero(self._heard & (self._ages < self._sent_n.shape[1]))
+        at = torch.from_numpy(remembered), torch.from_numpy(self._ages[remembered])
+        self._sent_n[at] = torch.from_numpy(played[remembered]).to(self._sent_n.dtype)
+        self._ages += 1
+        return played
+
+    def _plan(self, due: Bools) -> Tensor:
+        rows, ages = torch.from_numpy(due), torch.from_numpy(self._ages[due])
+        return self._reaction.plan(self._z[rows], ages, self._sent_n[rows])
 
 
 class LastForce:
-    """No prediction: act on each packet, then keep that force (hold) or none (zero).
+    """Acts on each packet, then keeps that force, lets it fade, or applies none.
 
-    With the teacher as actor and a packet at every step this is the optimal controller.
+    At age j it plays clip(s · C(packet) · e^(−j/τ)). With the teacher as actor and a packet at
+    every step this is the optimal controller.
 
     Args:
         actor: packets [m, ...] → forces_n [m, *A].
         devices: n.
-        keep: hold the last force between packets; ``False`` applies 0 N.
+        keep: play a force between packets at all; ``False`` applies 0 N.
+        gain: s, of all devices or of each [n].
+        tau_steps: τ > 0, likewise; ∞ holds the force.
+        force_limit_n: the actuator clips here.
         action_shape: A, of the plant.
     """
 
@@ -102,30 +147,38 @@ class LastForce:
         actor: Callable[[Any], Any],
         devices: int,
         *,
-        keep: bool,
+        keep: bool = True,
+        gain: float | Floats = 1.0,
+        tau_steps: float | Floats = np.inf,
+        force_limit_n: float = np.inf,
         action_shape: tuple[int, ...] = (),
     ) -> None:
-        self._actor, self._keep = actor, keep
+        self._actor, self._limit_n = actor, force_limit_n
+        column = (devices, *[1] * len(action_shape))
+        self._gain, self._kept = (
+            np.broadcast_to(value, devices).reshape(column)
+            for value in (gain, keep * np.exp(-1.0 / np.asarray(tau_steps)))
+        )
         self._forces_n = np.zeros((devices, *action_shape))
 
     @torch.inference_mode()
     def act(self, delivered: Bools, packets: Any) -> Floats:
-        """Forces of one step [n, *A]."""
-        if not self._keep:
-            self._forces_n[:] = 0.0
+        """Return the forces of one step [n, *A]; 0 N before a device's first packet."""
         if packets is not None:
             forces_n = self._actor(packets)
-            is_tensor = isinstance(forces_n, Tensor)
-            self._forces_n[delivered] = forces_n.float().cpu().numpy() if is_tensor else forces_n
-        return self._forces_n.copy()
+            fresh_n = forces_n.float().cpu().numpy() if isinstance(forces_n, Tensor) else forces_n
+            self._forces_n[delivered] = fresh_n * self._gain[delivered]
+        played = self.planned_n()
+        self._forces_n = self._forces_n * self._kept + 0.0  # which makes 0 of −0
+        return played
 
-    def outlook(self) -> Floats:
-        """Forces [n, *A] of the coming step if no packet comes."""
-        return self._forces_n.copy() if self._keep else np.zeros_like(self._forces_n)
+    def planned_n(self) -> Floats:
+        """Return the forces [n, *A] of the coming step if no packet comes."""
+        return np.clip(self._forces_n, -self._limit_n, self._limit_n)
 
 
 class Oracle:
-    """The ceiling for any predictor: the true state at each packet, exact equations in between.
+    """Plays the true state at each packet and exact equations in between: a predictor's ceiling.
 
     It knows the noise-free equations of the nominal plant, not the noise and not a device's own
     masses.
@@ -151,7 +204,7 @@ class Oracle:
         self._states = np.zeros((devices, states))
 
     def act(self, delivered: Bools, packets: Floats | None) -> Floats:
-        """Forces of one step [n, *A]; packets are true states [delivered.sum(), S]."""
+        """Return the forces of one step [n, *A]; packets are true states [delivered.sum(), S]."""
         if packets is not None:
             self._states[delivered] = packets
         forces_n = np.clip(self._actor(self._states), -self._limit_n, self._limit_n)
@@ -159,6 +212,6 @@ class Oracle:
         self._states = np.clip(self._advance(self._states, forces_n), -50.0, 50.0)
         return forces_n
 
-    def outlook(self) -> Floats:
-        """Forces [n, *A] of the coming step if no packet comes."""
+    def planned_n(self) -> Floats:
+        """Return the forces [n, *A] of the coming step if no packet comes."""
         return np.clip(self._actor(self._states), -self._limit_n, self._limit_n)

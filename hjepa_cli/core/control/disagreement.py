@@ -1,9 +1,9 @@
-"""How far two levels disagree about where a device is: an uncertainty that costs no packet.
+"""Two levels that disagree about where a device is tell how uncertain it is, without a packet.
 
 The hierarchy reaches the same step by different strides: P^H in one of h steps, the predictor of
 stride 1 in h of one. Played with the same forces from the same packet they drift apart as their
-models err, and the drift d = |C(z̃) − C(ẑ)| ÷ 40 N is known without a look at the device. What the
-growth table says of a device's age is scaled by it:
+models err, and the drift d = |C(z̃) − C(ẑ)| ÷ the force range is known without a look at the
+device. The value that the growth table has for a device's age is scaled by it:
 
     f(A, d) = f(A) (d / d̄(A))^(2β),
 
@@ -22,20 +22,17 @@ from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.core.control.controllers import StrideController
-from hjepa_cli.core.control.error_growth import Growth, conformal_growth
+from hjepa_cli.core.control.error_growth import ErrorGrowthTable, conformal_growth
 from hjepa_cli.core.control.force_error import control_error
 
 SMALLEST = 1e-5  # of the force range: levels that agree better have nothing to tell
 
 
 class TwoLevels:
-    """A stride controller with a second level beside it that plays no force.
+    """Plays strides of P^H with a controller, and the level of stride 1 beside it.
 
-    Args:
-        controller: plays; its strides are those of P^H.
-        step: the level of stride 1: embeddings [n, D] and forces_n [n, *A] → embeddings [n, D].
-        act: embeddings [n, D] → forces_n [n, *A].
-        force_limit_n: of the actuator.
+    That one, ``step``, goes from embeddings [n, D] under forces_n [n, *A] to embeddings, and plays
+    no force; the actor ``act`` would answer embeddings [n, D] with forces_n [n, *A].
     """
 
     def __init__(
@@ -52,7 +49,7 @@ class TwoLevels:
 
     @torch.inference_mode()
     def act(self, delivered: Bools, packets: Any) -> Floats:
-        """As the controller's."""
+        """Return the controller's forces [n, *A], and let the second level follow them."""
         forces_n = self._controller.act(delivered, packets)
         if packets is not None:
             if not len(self._beside):
@@ -69,47 +66,41 @@ class TwoLevels:
             self._apart[over] = apart.reshape(len(rows), -1).mean(axis=1)
         return forces_n
 
-    def outlook(self) -> Floats:
-        """As the controller's."""
-        return self._controller.outlook()
+    def planned_n(self) -> Floats:
+        """Return the controller's forces [n, *A] of the coming step if no packet comes."""
+        return self._controller.planned_n()
 
     @property
     def apart(self) -> Floats:
-        """d: how far the levels were apart when each device's last stride ended [n]."""
+        """Return how far the levels were apart when each device's last stride ended: d [n]."""
         return self._apart
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Levels:
-    """What disagreement adds to a growth table.
+class LevelDisagreement:
+    """Scales a growth table f(A) by how far each device's levels disagree.
 
-    Attributes:
-        growth: f(A).
-        typical: d̄(1) … d̄(A_max).
-        exponent: β, 0 to 1.
+    ``mean_apart`` holds d̄(1) … d̄(A_max); the ``exponent`` β lies in 0 … 1.
     """
 
-    growth: Growth
-    typical: Floats
+    growth: ErrorGrowthTable
+    mean_apart: Floats
     exponent: float
 
-    def doubt(self, age: ArrayLike, apart: Floats) -> Floats:
-        """f(A, d) ÷ f(A) of devices at ages A ≥ 1 whose levels are d apart."""
-        place = np.minimum(np.asarray(age, np.int64), len(self.typical)) - 1
-        relative = np.maximum(apart, SMALLEST) / self.typical[place]
+    def relative_growth(self, age: ArrayLike, apart: Floats) -> Floats:
+        """Return f(A, d) ÷ f(A) of devices at ages A ≥ 1 whose levels are d apart."""
+        place = np.minimum(np.asarray(age, np.int64), len(self.mean_apart)) - 1
+        relative = np.maximum(apart, SMALLEST) / self.mean_apart[place]
         return np.asarray(relative ** (2.0 * self.exponent))
 
 
-def calibrate_levels(ages: Sequence[int], errors: Floats, apart: Floats) -> Levels:
+def calibrate_levels(ages: Sequence[int], errors: Floats, apart: Floats) -> LevelDisagreement:
     """Fit d̄ and β on half of the devices, and the growth table of what is left on the other half.
 
     So the split-conformal promise holds for f(A, d): a new device of the same kind stays below
-    √f(A, d) with the table's probability.
-
-    Args:
-        ages: ascending ages ≥ 1 [G].
-        errors: absolute errors [n, G] of n devices without a packet since age 0.
-        apart: d of the same devices at the same ages [n, G].
+    √f(A, d) with the table's probability. Arguments are those of
+    :func:`~hjepa_cli.core.control.error_growth.conformal_growth`, and d of the same devices at the
+    same ages, ``apart`` [n, G].
     """
     half = len(errors) // 2
     d = np.log(np.maximum(apart, SMALLEST))
@@ -117,6 +108,6 @@ def calibrate_levels(ages: Sequence[int], errors: Floats, apart: Floats) -> Leve
     centre = d[:half].mean(axis=0)
     spread, met = d[:half] - centre, error[:half] - error[:half].mean(axis=0)
     exponent = float(np.clip((spread * met).sum() / max((spread**2).sum(), 1e-12), 0.0, 1.0))
-    typical = np.exp(np.interp(np.arange(1, ages[-1] + 1), ages, centre))
+    mean_apart = np.exp(np.interp(np.arange(1, ages[-1] + 1), ages, centre))
     scaled = errors[half:] / np.exp(exponent * (d[half:] - centre))
-    return Levels(conformal_growth(ages, scaled), typical, exponent)
+    return LevelDisagreement(conformal_growth(ages, scaled), mean_apart, exponent)

@@ -1,9 +1,9 @@
-"""How fast a controller's error grows while no packet arrives, and what a packet is worth then.
+"""A controller's error grows while no packet arrives: this measures it, and a packet's worth then.
 
 f(A) is a table over the age A = 1 … A_max of the newest sample: the squared error of the force,
-|C(z̃) − C(z)| ÷ 40 N, that a share p of devices stays below. The quantile is split-conformal, so a
-new device of the same kind stays below it with probability p whatever the distribution; the table
-is made monotone from below, so that it keeps that promise.
+|C(z̃) − C(z)| ÷ the force range, that a share p of devices stays below. The quantile is
+split-conformal, so a new device of the same kind stays below it with probability p whatever the
+distribution; the table is made monotone from below, so that it keeps that promise.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ COVERAGE = 0.9
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Growth:
-    """f over ages: 0 at age 0, constant beyond the last.
+class ErrorGrowthTable:
+    """Tabulates f over ages: 0 at age 0, constant beyond the last.
 
     Attributes:
         table: f(1) … f(A_max), not falling.
@@ -30,11 +30,14 @@ class Growth:
     table: Floats
 
     def at(self, age: ArrayLike) -> Floats:
-        """f(A) for ages ≥ 1."""
+        """Return f(A) for ages A ≥ 1."""
         return np.asarray(self.table[self._place(age)])
 
     def index(self, age: ArrayLike) -> Floats:
-        """Whittle's index with certain success: A f(A + 1) − Σ_{j=1..A} f(j); not falling in A."""
+        """Return Whittle's index with certain success, A f(A + 1) − Σ_{j=1..A} f(j).
+
+        It does not fall in A.
+        """
         age = np.asarray(age, np.int64)
         place = self._place(age)
         # Beyond the table f stays at its last value, and the index with it.
@@ -45,19 +48,21 @@ class Growth:
         return np.minimum(np.asarray(age, np.int64), len(self.table)) - 1
 
 
-def conformal_growth(ages: Sequence[int], errors: Floats, coverage: float = COVERAGE) -> Growth:
-    """Calibrate a growth table on held-out devices.
+def conformal_growth(
+    ages: Sequence[int], errors: Floats, coverage: float = COVERAGE
+) -> ErrorGrowthTable:
+    """Calibrate a growth table on n held-out devices without a packet since age 0.
 
     Args:
         ages: ascending ages ≥ 1 [G] that errors were measured at; in between f is interpolated.
-        errors: absolute errors [n, G] of n devices without a packet since age 0.
+        errors: absolute errors [n, G].
         coverage: p; the rank ⌈(n + 1) p⌉ of n errors is the split-conformal quantile.
 
     Raises:
         UsageError: fewer devices than p needs.
     """
     count = len(errors)
-    rank = math.ceil((count + 1) * coverage)
+    rank = math.ceil((count + 1) * coverage - 1e-9)  # a whole number up to rounding is that one
     if rank > count:
         raise UsageError(
             f"{count} devices cannot calibrate a quantile of {coverage:g}; "
@@ -66,26 +71,4 @@ def conformal_growth(ages: Sequence[int], errors: Floats, coverage: float = COVE
     quantile = np.sort(errors, axis=0)[rank - 1]
     monotone = np.maximum.accumulate(quantile)  # pooling ages would lower some of them
     every = np.arange(1, ages[-1] + 1)
-    return Growth(np.interp(every, [0, *ages], [0.0, *monotone]) ** 2)
-
-
-def periodic_cost(schedule: Sequence[int], costs: Sequence[Floats]) -> float:
-    """Mean cost per slot of loops that share one channel by a schedule repeated forever.
-
-    Args:
-        schedule: which loop sends in each slot of a period.
-        costs: per loop, its cost in a slot by the age of its newest sample, from age 0 on.
-
-    Returns:
-        Sum over loops of the mean cost; ∞ where a loop never sends or an age leaves its table.
-    """
-    period, total = len(schedule), 0.0
-    for loop, table in enumerate(costs):
-        turns = [slot for slot in range(period) if schedule[slot] == loop]
-        if not turns:
-            return math.inf
-        ages = [min((slot - turn) % period for turn in turns) for slot in range(period)]
-        if max(ages) >= len(table):
-            return math.inf
-        total += sum(float(table[age]) for age in ages) / period
-    return total
+    return ErrorGrowthTable(np.interp(every, [0, *ages], [0.0, *monotone]) ** 2)

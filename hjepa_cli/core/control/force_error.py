@@ -1,4 +1,4 @@
-"""How far a controller's forces are from those that the teacher, or a fresh packet, would give."""
+"""A controller's forces err by their distance from the teacher's, or a fresh packet's."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,12 @@ WINDOWS = ((1, 20), (21, 40), (41, 80), (81, 100))
 
 
 def control_error(forces_n: Floats, teacher_n: Floats, force_limit_n: float) -> Floats:
-    """|ũ - u*| ÷ the force range 2 · limit (40 N), elementwise; its mean is the NMAE."""
+    """Return |ũ − u*| ÷ the force range, 2 · limit, elementwise; its mean is the NMAE."""
     return np.abs(forces_n - teacher_n) / (2 * force_limit_n)
 
 
 def window_means(error: Floats, windows: Sequence[tuple[int, int]] = WINDOWS) -> dict[str, Floats]:
-    """Mean control error over the windows of the horizon, both ends included.
+    """Average the control error over the windows of the horizon, both ends included.
 
     Args:
         error: [..., J + 1], ``error[..., j]`` is j steps after the transmission.

@@ -1,4 +1,4 @@
-"""The anchor ``linear``: embeddings that move linearly, z' = A z + B u + c, fitted in closed form.
+"""Embeddings may move linearly, z' = A z + B u + c, as fitted in closed form.
 
 What the hierarchy's predictors have to beat to earn their training.
 """
@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hjepa_cli.config.settings import Settings
-from hjepa_cli.core.control.embedded_trajectories import Typical, typical
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.embedded_split import EmbeddedSplit, embed_split
 from hjepa_cli.core.networks.encoder import normalise
 from hjepa_cli.core.networks.symmetry import reflect
 from hjepa_cli.core.plants.named import plant
@@ -25,7 +25,7 @@ RIDGES = tuple(float(weight) for weight in np.logspace(-8, 0, 9))  # x mean squa
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LinearLatent:
-    """One step of embeddings and actions: z' = z + [z, u, 1] W.
+    """Moves embeddings linearly under actions: z' = z + [z, u, 1] W.
 
     Attributes:
         weights: W [D + F + 1, D], for F actions in units of the force limit.
@@ -36,19 +36,15 @@ class LinearLatent:
     ridge: float
 
     def step(self, z: Tensor, actions: Tensor) -> Tensor:
-        """Embeddings [n, D], actions [n, F] → embeddings [n, D], of any length."""
+        """Move embeddings [n, D] by a step under actions [n, F]; their length is free."""
         return z + torch.cat([z, actions, torch.ones_like(z[:, :1])], dim=1) @ self.weights
 
 
 class LinearPlanner:
     """Plays a linear latent model, one step at a time.
 
-    The state stays linear; the actor sees it at the length that embeddings have.
-
-    Args:
-        latent: the model.
-        actor: embeddings [n, D] → forces_n [n, *A].
-        force_limit_n: what an action of 1 stands for.
+    The state stays linear; the actor, from embeddings [n, D] to forces_n [n, *A], sees it at the
+    length that embeddings have. An action of 1 stands for the force limit.
     """
 
     stride = 1
@@ -59,7 +55,7 @@ class LinearPlanner:
         self._latent, self._actor, self._limit_n = latent, actor, force_limit_n
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`~hjepa_cli.core.control.controllers.Planner`."""
+        """Plan a step, as :class:`~hjepa_cli.core.networks.planning.Planner` says."""
         forces_n = self._actor(normalise(z))
         return forces_n.unsqueeze(1), self._latent.step(
             z, forces_n.reshape(len(z), -1) / self._limit_n
@@ -74,7 +70,7 @@ def fit_linear_latent(model: "Model", settings: Settings) -> LinearLatent:
     distance at an embedding's length). What is penalised is the change that a step makes.
     """
     signs = plant(model.plant_name).force_signs if model.architecture["mirror"] == "exact" else None
-    train, test = (typical(model, settings, split) for split in ("train", "test"))
+    train, test = (embed_split(model, settings, split) for split in ("train", "test"))
     fits = ridge_fits(train, signs)
     errors = [rollout_error(fit, test) for fit in fits]
     best = fits[int(np.argmin(errors))]
@@ -82,12 +78,10 @@ def fit_linear_latent(model: "Model", settings: Settings) -> LinearLatent:
     return LinearLatent(weights, best.ridge)
 
 
-def ridge_fits(data: Typical, signs: tuple[float, ...] | None) -> list[LinearLatent]:
-    """One fit for each of :data:`RIDGES`, in float64.
+def ridge_fits(data: EmbeddedSplit, signs: tuple[float, ...] | None) -> list[LinearLatent]:
+    """Fit once for each of :data:`RIDGES`, in float64.
 
-    Args:
-        data: trajectories.
-        signs: what a mirror does to each force; then the mirror images count as data too.
+    With ``signs``, what a mirror does to each force, the mirror images count as data too.
     """
     z, z_next = data.z[:, :-1].flatten(0, 1).double(), data.z[:, 1:].flatten(0, 1).double()
     actions = torch.from_numpy(data.actions[:, :-1]).flatten(0, 1)
@@ -105,8 +99,8 @@ def ridge_fits(data: Typical, signs: tuple[float, ...] | None) -> list[LinearLat
     ]
 
 
-def rollout_error(latent: LinearLatent, data: Typical) -> float:
-    """Mean squared distance of open-loop rollouts from k = 0 on; infinite if they blow up."""
+def rollout_error(latent: LinearLatent, data: EmbeddedSplit) -> float:
+    """Return the mean squared distance of open-loop rollouts from k = 0 on; ∞ if they blow up."""
     z, actions = data.z[:, 0].double(), torch.from_numpy(data.actions)
     total = 0.0
     for k in range(data.z.shape[1] - 1):

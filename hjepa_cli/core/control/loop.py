@@ -1,4 +1,4 @@
-"""The closed loop: plants, the link's schedule and a controller, batched over devices and points.
+"""The closed loop runs plants, link and controller, batched over devices and points.
 
 One step k of every loop, in this order:
 
@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.settings import ProtocolSettings
+from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
@@ -35,17 +35,13 @@ GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples, modulo 1, spread evenly howeve
 
 
 class Controller(Protocol):
-    """The remote side. It has no way to the plant: packets come in, forces go out."""
+    """Is the remote side, which has no way to the plant: packets come in, forces go out."""
 
     def act(self, delivered: Bools, packets: Any) -> Floats:
-        """Forces of one step.
+        """Return the forces of one step in newton [n, *A].
 
-        Args:
-            delivered: which devices' packets arrive at this step [n].
-            packets: what they carry [delivered.sum(), ...]; ``None`` when there are none.
-
-        Returns:
-            Forces in newton [n, *A].
+        Of the devices ``delivered`` [n] packets arrive, which carry ``packets``
+        [delivered.sum(), ...]; ``None`` when there are none.
         """
         ...
 
@@ -60,7 +56,7 @@ Those before a device was switched on are copies of its first; see
 
 @dataclasses.dataclass(frozen=True)
 class Draws:
-    """Everything random in the closed loop, common to all methods and curve points.
+    """Holds all random numbers of the closed loop, common to all methods and curve points.
 
     Device i's draws come from its own generator: they do not depend on how many devices there
     are, so the first 64 of 256 devices are the 64 devices.
@@ -103,14 +99,9 @@ class Draws:
         return len(self.noise)
 
     def part(self, devices: slice) -> "Draws":
-        """The draws of some of the devices."""
-        return Draws(
-            self.initial[devices],
-            self.noise[:, devices],
-            self.delivery[:, devices],
-            self.mass_scale[devices],
-            self.warmup_steps,
-        )
+        """Take the draws of some of the devices."""
+        by_step = self.noise[:, devices], self.delivery[:, devices]
+        return Draws(self.initial[devices], *by_step, self.mass_scale[devices], self.warmup_steps)
 
 
 def device_draws(
@@ -128,7 +119,7 @@ def device_draws(
 
 
 def noise_per_step(protocol: ProtocolSettings) -> Floats:
-    """Standard deviation of the process noise of one step in each state [S].
+    """Return the standard deviation of the process noise of one step in each state [S].
 
     ``velocity`` disturbs velocities, as forces would; ``isotropic`` has one standard deviation,
     that of the first velocity, in all states (the paper's n_s, whose size it leaves open).
@@ -138,24 +129,19 @@ def noise_per_step(protocol: ProtocolSettings) -> Floats:
 
 
 def every_step(steps: int, devices: int) -> Bools:
-    """The schedule of a perfect link: bool [steps, devices], all true."""
+    """Return the schedule of a perfect link: bool [steps, devices], all true."""
     return np.ones((steps, devices), dtype=bool)
 
 
 def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
-    """One packet every D steps: device i sends at 0, and at ⌈nD + φ_i⌉ for n = 0, 1, …
+    """Schedule one packet every D steps: device i sends at 0, and at ⌈nD + φ_i⌉ for n = 0, 1, …
 
     The packet at 0 is one more than the period asks for: :func:`packets_per_step` counts it. The
     phases φ_i = D · (i · golden ratio mod 1) spread any number of devices evenly over a period.
-
-    Args:
-        gap_steps: D ≥ 1, whole or fractional, finite.
-
-    Returns:
-        bool [steps, devices].
+    Returns bool [steps, devices].
 
     Raises:
-        UsageError: D < 1, or infinite.
+        UsageError: a gap D, whole or fractional, that is below 1 or infinite.
     """
     if not 1 <= gap_steps < math.inf:
         raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer, and finite")
@@ -174,26 +160,16 @@ def packets_per_step(gap_steps: npt.ArrayLike, scored_steps: int, warmup_steps: 
     """Return how many packets a loop under :func:`gap_schedule` sends per scored step.
 
     It is 1/D in steady state, and 1/D + (1 − 1/D)/K where the K scored steps begin with the loop,
-    since everybody is heard once at step 0 whatever its phase.
-
-    Args:
-        gap_steps: D ≥ 1.
-        scored_steps: K.
-        warmup_steps: unscored steps before them.
+    without a warm-up, since everybody is heard once at step 0 whatever its phase.
     """
     periodic = 1.0 / np.asarray(gap_steps, np.float64)
     return periodic if warmup_steps else periodic + (1.0 - periodic) / scored_steps
 
 
 def delivery_schedule(probability: float, delivery: Floats) -> Bools:
-    """Every step is sent and gets through with probability p; the first packet always does.
+    """Schedule a packet at every step that arrives with probability p; the first always does.
 
-    Args:
-        probability: p in 0 … 1.
-        delivery: uniform numbers [steps, devices].
-
-    Returns:
-        bool [steps, devices].
+    From uniform numbers [steps, devices] this makes bool [steps, devices].
 
     Raises:
         UsageError: p outside 0 … 1.
@@ -207,12 +183,12 @@ def delivery_schedule(probability: float, delivery: Floats) -> Bools:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a simulation measured, averaged over its scored steps.
+    """Holds measurements of a simulation, averaged over its scored steps.
 
     Attributes:
         score: share of steps inside the band [P, N].
         cost: mean capped quadratic cost [P, N].
-        lost: 1 where the loop is :attr:`World.lost` after the last step, else 0 [P, N].
+        lost: 1 where the loop is :attr:`ScoredPlants.lost` after the last step, else 0 [P, N].
     """
 
     score: Floats
@@ -262,20 +238,20 @@ def simulate(
         np.tile(drawn, (points, 1)) for drawn in (draws.initial, draws.mass_scale)
     )
     noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
-    world = World(plant, initial, mass_scale, noise, draws.warmup_steps)
+    plants = ScoredPlants(plant, initial, mass_scale, noise, draws.warmup_steps)
     nothing = np.zeros(points * devices, dtype=bool), None
     under_way = deque([nothing] * min(delay_steps, steps))
     for k in range(steps):
-        states, sent = world.states, delivered[:, k].reshape(-1)
-        under_way.append((sent, world.sense(sensor, sent)))
-        watch(k, states, world.move(controller.act(*under_way.popleft())))
+        states, sent = plants.states, delivered[:, k].reshape(-1)
+        under_way.append((sent, plants.sense(sensor, sent)))
+        watch(k, states, plants.move(controller.act(*under_way.popleft())))
         tick()
-    means = world.means(steps - draws.warmup_steps)
+    means = plants.means(steps - draws.warmup_steps)
     return Outcome(*(values.reshape(points, devices) for values in means))
 
 
-class World:
-    """Plants that go on step by step, each step scored.
+class ScoredPlants:
+    """Moves plants step by step, and scores each step.
 
     Args:
         plant: of all devices.
@@ -298,7 +274,7 @@ class World:
         warmup_steps: int = 0,
     ) -> None:
         devices = len(initial)
-        self._plant, self._noise = plant, noise
+        self.plant, self._noise = plant, noise
         self._plants = plant.simulation(devices, mass_scale=mass_scale)
         self._plants.states = initial
         switched_on = [self._plants.states] * (LONGEST - 1)
@@ -310,37 +286,37 @@ class World:
 
     @property
     def lost(self) -> Bools:
-        """Whether each loop's state, as it is now, costs as much as a step can [N].
+        """Return whose state, as it is now, costs as much as a step can: bool [N].
 
-        The stage cost is capped (:data:`~hjepa_cli.core.statistics.COST_CAP`) where control has lost
-        the device: a cart-pole of plant desktop whose pole leans by more than 1.58 rad, or whose
-        cart is further than 1.58 m away.
+        The stage cost is capped (:data:`~hjepa_cli.core.plants.cost.COST_CAP`) where control has
+        lost the device: a cart-pole of plant desktop whose pole leans by more than 1.58 rad, or
+        whose cart is further than 1.58 m away.
         """
-        at_rest = self._plant.no_force(len(self.states))
-        return np.asarray(self._plant.cost(self.states, at_rest) >= COST_CAP)
+        at_rest = self.plant.no_force(len(self.states))
+        return np.asarray(self.plant.cost(self.states, at_rest) >= COST_CAP)
 
     def means(self, scored_steps: int) -> tuple[Floats, Floats, Floats]:
         """Return score and cost per scored step, and who is lost as 0 or 1 [N] each."""
         return self.score / scored_steps, self.cost / scored_steps, self.lost.astype(np.float64)
 
     def sense(self, sensor: Sensor, devices: Bools) -> Any:
-        """Packets of some devices; ``None`` where there are none."""
+        """Return the packets of some devices; ``None`` where there are none."""
         if not devices.any():
             return None
         return sensor(np.stack([states[devices] for states in self._seen], axis=1))
 
     def move(self, forces_n: Floats) -> Floats:
-        """Score this step and go on to the next; returns the forces as applied [N, *A].
+        """Score this step and go on to the next; return the forces as applied [N, *A].
 
         Raises:
             NumericalError: a force is not finite.
         """
         if not np.isfinite(forces_n).all():
             raise NumericalError(f"the controller's force is not finite at step {self._step}")
-        forces_n = np.clip(forces_n, -self._plant.force_limit_n, self._plant.force_limit_n)
+        forces_n = np.clip(forces_n, -self.plant.force_limit_n, self.plant.force_limit_n)
         if self._step >= self._warmup_steps:
-            self.score += self._plant.in_band(self.states)
-            self.cost += self._plant.cost(self.states, forces_n)
+            self.score += self.plant.in_band(self.states)
+            self.cost += self.plant.cost(self.states, forces_n)
         self._plants.step(forces_n)
         moved = self._plants.states + next(self._noise)
         self._plants.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
@@ -351,17 +327,5 @@ class World:
 
 
 def last_states(rollouts: Floats, k: int) -> Floats:
-    """What a sensor gets in step k of rollouts [R, steps + 1, S], whose index 0 is before k = 0."""
+    """Return what a sensor gets in step k of rollouts [R, steps + 1, S], stored from k = −1 on."""
     return rollouts[:, frames_seen(k, LONGEST)]
-
-
-def play(
-    controller: Controller, packets: Any, devices: int, steps: int, *, delay_steps: int = 0
-) -> Floats:
-    """What a controller plays after a single packet, sent at k = 0: forces [devices, steps, *A]."""
-    arrives = np.ones(devices, dtype=bool)
-    forces = [
-        controller.act(*((arrives, packets) if k == delay_steps else (~arrives, None)))
-        for k in range(steps)
-    ]
-    return np.stack(forces, axis=1)

@@ -10,37 +10,29 @@ import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
 from hjepa_cli.core.plants.frames import FRAME_SHAPE
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import (
-    DataError,
-    HjepaError,
-    MissingInputError,
-    NumericalError,
-    UsageError,
-)
-from hjepa_cli.storage import files
+from hjepa_cli.errors import DataError, HjepaError, MissingInputError, NumericalError, UsageError
+from hjepa_cli.storage import files, seals
 from hjepa_cli.storage import tensors as arrays
-from hjepa_cli.storage.shards import LOG, Described, Shard, cut
+from hjepa_cli.storage.shards import LOG, Described, Shard
 from hjepa_cli.storage.shards import NAME as SHARD_NAME
 
 SCHEMA = 1
 FORMAT = "hjepa-dataset"
 MANIFEST = "dataset.json"
-SPLITS = ("train", "test", "clean")
 SHARD_TRAJECTORIES = 1000
 SHARD_TRAJECTORIES_WITH_FRAMES = 50  # about 120 MB
 
 
 @dataclasses.dataclass(frozen=True)
 class Trajectories:
-    """N trajectories of T steps; index 0 of states and frames is the frame before k = 0.
-
-    The state at step k is ``states[:, k + 1]``.
+    """It holds N trajectories of T steps; the state at step k is ``states[:, k + 1]``.
 
     Args:
         states: float32 [N, T + 1, S], the plant's states; of a cart-pole x (m), x_dot (m/s), theta
@@ -60,23 +52,54 @@ class Trajectories:
 
     @property
     def steps(self) -> int:
-        """T, the number of control steps of each trajectory."""
+        """Return T, the number of control steps of each trajectory."""
         return int(self.applied_n.shape[1])
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the arrays by name, without absent frames."""
-        named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {name: array for name, array in named.items() if array is not None}
+        return {name: array for name, array in vars(self).items() if array is not None}
 
     def __getitem__(self, rows: slice) -> "Trajectories":
         return Trajectories(**{name: array[rows] for name, array in self.tensors().items()})
 
 
+class _ShardEntry(msgspec.Struct):
+    name: Annotated[str, msgspec.Meta(pattern=rf"\A{SHARD_NAME.pattern}\Z")]  # leads nowhere else
+    trajectories: int
+    sha256: str
+
+
+class _SplitEntry(msgspec.Struct):
+    steps: int
+    trajectories: int
+    shards: Annotated[list[_ShardEntry], msgspec.Meta(min_length=1)]
+
+    def __post_init__(self) -> None:
+        if self.trajectories != sum(shard.trajectories for shard in self.shards):
+            raise ValueError("`trajectories` is not the sum over the shards")
+
+
+class _Config(msgspec.Struct):
+    collect: dict[str, Any] = {}
+
+
+class _Manifest(msgspec.Struct):
+    """It is all of ``dataset.json`` that :class:`Dataset` relies on."""
+
+    plant: str
+    config: _Config
+    camera: dict[str, Any]
+    frames: Literal["stored", "rendered"]
+    splits: Annotated[
+        dict[Literal["train", "test", "clean"], _SplitEntry], msgspec.Meta(min_length=1)
+    ]
+
+
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """An opened dataset directory; shards are read and verified by :meth:`split`."""
+    """Its manifest is verified; shards are read and verified by :meth:`split`."""
 
-    path: Path
+    path: Path  # the others in the order in which :func:`load_dataset` takes them
     plant: str
     settings: dict[str, Any]
     camera: dict[str, Any]
@@ -104,61 +127,20 @@ class Dataset:
         path = self.path / shard["name"]
         stored = self.frames == "stored"
         expected = _expected(shard["trajectories"], steps, stored, path, self.plant)
-        data = files.read_bytes(path, limit=_largest_bytes(expected))
+        values = (np.dtype(name).itemsize * math.prod(shape) for name, shape in expected.values())
+        limit_bytes = sum(values) + arrays.HEADER_LIMIT_BYTES + 8
+        data = files.read_bytes(path, limit=limit_bytes)
         if hashlib.sha256(data).hexdigest() != shard["sha256"]:
             raise DataError(
                 f"{path} was changed or truncated after it was written: its sha256 does not match",
                 hint="collect the dataset again: hjepa collect",
             )
         tensors, _ = arrays.unpack(data, path)
-        _check(tensors, expected, path)
-        if bad := _not_finite(tensors):
+        if reason := arrays.difference(tensors, expected):
+            raise DataError(f"{path}: {reason}")
+        if bad := arrays.non_finite(tensors):
             raise DataError(f"{path}: '{bad}' holds NaN or an infinity")
         return tensors
-
-
-def write_dataset(
-    directory: Path,
-    *,
-    settings: Mapping[str, Any],
-    splits: Mapping[str, Trajectories],
-    plant_name: str,
-    camera_manifest: Mapping[str, Any],
-) -> Dataset:
-    """Write the splits into ``directory`` (see :func:`open_directory`), ``dataset.json`` last.
-
-    Args:
-        directory: an existing directory without a dataset.
-        settings: what the data was made with, including ``seed``; plain JSON data.
-        splits: ``train``, ``test`` and ``clean``; all with frames, or none.
-        plant_name: the plant the trajectories come from.
-        camera_manifest: the renderer's version, colours and sizes.
-
-    Raises:
-        DataError: wrong shapes or dtypes.
-        NumericalError: values that are not finite; they are not written.
-        UsageError: there is a dataset in ``directory`` already.
-        StorageError: the disk refused; no dataset is left behind.
-    """
-    if (directory / MANIFEST).exists():
-        raise UsageError(f"{directory} holds a dataset already", hint="choose another --out DIR")
-    _remove_shards(directory)
-    stored = any(split.frames is not None for split in splits.values())
-    for name, split in splits.items():
-        where = directory / name
-        expected = _expected(len(split), split.steps, stored, where, plant_name)
-        _check(split.tensors(), expected, where)
-    done = [
-        write_shard(directory, shard, splits[shard.split][shard.start : shard.stop], plant_name)
-        for shard in cut({name: len(split) for name, split in splits.items()}, per_shard(stored))
-    ]
-    return write_manifest(
-        directory,
-        settings=settings,
-        shards=done,
-        plant_name=plant_name,
-        camera_manifest=camera_manifest,
-    )
 
 
 def write_shard(
@@ -171,18 +153,19 @@ def write_shard(
         NumericalError: values that are not finite; they are not written.
         StorageError: the disk refused.
     """
-    stored = trajectories.frames is not None
+    stored, tensors = trajectories.frames is not None, trajectories.tensors()
     path = directory / shard.name
     expected = _expected(len(trajectories), trajectories.steps, stored, path, plant_name)
-    _check(trajectories.tensors(), expected, path)
-    if bad := _not_finite(trajectories.tensors()):
-        row, index, *_ = np.argwhere(~np.isfinite(trajectories.tensors()[bad]))[0]
+    if reason := arrays.difference(tensors, expected):
+        raise DataError(f"{path}: {reason}")
+    if bad := arrays.non_finite(tensors):
+        row, index, *_ = np.argwhere(~np.isfinite(tensors[bad]))[0]
         raise NumericalError(
             f"trajectory {shard.start + row} of split '{shard.split}': '{bad}' is not finite from "
             f"index {index} on",
             hint="--config FILE.toml with smaller forces or starts in [collect]",
         )
-    data = arrays.pack(trajectories.tensors())
+    data = arrays.pack(tensors)
     files.write_bytes(path, data)
     return {
         "name": shard.name,
@@ -204,10 +187,8 @@ def write_manifest(
 ) -> Dataset:
     """Write ``dataset.json``, which makes the written shards a dataset.
 
-    Args:
-        directory: where the shards are.
-        settings, plant_name, camera_manifest: as for :func:`write_dataset`.
-        shards: what :func:`write_shard` returned, in the order of their numbers.
+    ``settings`` are what it was made with, ``seed`` included; ``shards`` are what
+    :func:`write_shard` returned, in the order of their numbers.
     """
     stored = any(shard["stored"] for shard in shards)
     described: dict[str, Any] = {}
@@ -219,7 +200,6 @@ def write_manifest(
     manifest = {
         "format": FORMAT,
         "schema": SCHEMA,
-        "sha256": "",
         "plant": plant_name,
         "seed": settings.get("seed"),
         "config": dict(settings),
@@ -227,17 +207,12 @@ def write_manifest(
         "frames": "stored" if stored else "rendered",
         "splits": described,
     }
-    manifest["sha256"] = arrays.content_digest(manifest, {})
-    files.write_json(directory / MANIFEST, manifest)
+    files.write_json(directory / MANIFEST, seals.sealed(manifest))
     return load_dataset(directory)
 
 
 def load_dataset(path: Path, plant_name: str | None = None) -> Dataset:
-    """Open a dataset directory and verify its manifest.
-
-    Args:
-        path: the directory.
-        plant_name: refuse a dataset of any other plant.
+    """Open a dataset directory (of a plant) and verify its manifest.
 
     Raises:
         MissingInputError: no such directory.
@@ -251,46 +226,36 @@ def load_dataset(path: Path, plant_name: str | None = None) -> Dataset:
     if manifest.get("format") != FORMAT:
         raise DataError(f"{path} is not an hjepa dataset: its {MANIFEST} is of another program")
     files.check_schema(manifest.get("schema"), SCHEMA, f"dataset {path}")
-    digest = arrays.content_digest({**manifest, "sha256": ""}, {})
-    if manifest.get("sha256") != digest:
-        raise DataError(
-            f"{path / MANIFEST} was changed after it was written: its sha256 does not match",
-            hint="collect the dataset again: hjepa collect",
-        )
-    _check_manifest(manifest, path)
+    seals.check(manifest, path / MANIFEST, "collect the dataset again: hjepa collect")
+    try:
+        msgspec.convert(manifest, _Manifest)
+    except msgspec.ValidationError as error:
+        raise DataError(f"{path / MANIFEST} lacks fields or has malformed ones: {error}") from None
     if plant_name is not None and manifest["plant"] != plant_name:
         raise DataError(
             f"dataset {path} belongs to plant {manifest['plant']}, not {plant_name}",
             hint=f"hjepa collect with a preset of plant {plant_name}",
         )
-    return Dataset(
-        path=path,
-        plant=manifest["plant"],
-        settings=manifest["config"],
-        camera=manifest["camera"],
-        digest=digest,
-        frames=manifest["frames"],
-        splits=manifest["splits"],
-    )
+    fields = ("plant", "config", "camera", "sha256", "frames", "splits")
+    return Dataset(path, *(manifest[name] for name in fields))
 
 
 @contextlib.contextmanager
-def open_directory(out: Path | None, plant_name: str, root: Path = Path("data")) -> Iterator[Path]:
-    """Create and lock the directory for a new dataset: ``out``, else ``data/<plant>-<nnnn>``.
-
-    If it holds a dataset already it is yielded as it is: check for ``dataset.json``.
+def open_directory(out: Path | None, plant_name: str) -> Iterator[Path]:
+    """Create and lock ``out``, else ``data/<plant>-<nnnn>``; a dataset that is there stays.
 
     Raises:
         UsageError: ``out`` holds files that are not ours.
         LockedError: another process collects into it.
-        StorageError: not writable.
     """
-    if out is None:
-        directory = files.next_directory(root, f"{plant_name}-")
+    directory = out or files.next_directory(Path("data"), f"{plant_name}-")
+    files.make_directory(directory)
+    if (directory / MANIFEST).exists():
+        load_dataset(directory)  # a foreign or damaged dataset.json says so itself
     else:
-        directory = out
-        files.make_directory(directory)
-        _refuse_foreign(directory)
+        files.refuse_foreign(
+            directory, "dataset", lambda name: name == LOG or bool(SHARD_NAME.fullmatch(name))
+        )
     with files.lock_directory(directory):
         yield directory
 
@@ -306,16 +271,12 @@ def find_newest_dataset(root: Path, plant_name: str | None = None) -> Path | Non
 
 
 def per_shard(stored: bool) -> int:
-    """Trajectories of a shard, with stored frames or without."""
+    """Return how many trajectories a shard has, with stored frames or without."""
     return SHARD_TRAJECTORIES_WITH_FRAMES if stored else SHARD_TRAJECTORIES
 
 
-Shapes = Mapping[str, tuple[str, tuple[int, ...]]]
-"""Names of tensors with dtype and shape."""
-
-
-def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str) -> Shapes:
-    """The tensors of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
+def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str) -> arrays.Shapes:
+    """Return the tensors of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
     try:
         kind = plant(plant_name)
     except UsageError as error:
@@ -331,76 +292,3 @@ def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str
     if stored:
         expected["frames"] = ("uint8", (count, steps + 1, *FRAME_SHAPE))
     return expected
-
-
-def _largest_bytes(expected: Shapes) -> int:
-    """What a shard may take on disk; more is not even read."""
-    values = sum(np.dtype(name).itemsize * math.prod(shape) for name, shape in expected.values())
-    return values + arrays.HEADER_LIMIT_BYTES + 8
-
-
-def _check(tensors: Mapping[str, np.ndarray], expected: Shapes, where: Path) -> None:
-    """Demand these tensors and no others."""
-    if tensors.keys() != expected.keys():
-        raise DataError(f"{where} holds {sorted(tensors)}; expected {sorted(expected)}")
-    for name, (dtype, shape) in expected.items():
-        array = tensors[name]
-        if (array.dtype.name, array.shape) != (dtype, shape):
-            raise DataError(
-                f"{where}: '{name}' is {array.dtype.name} {array.shape}; expected {dtype} {shape}"
-            )
-
-
-def _not_finite(tensors: Mapping[str, np.ndarray]) -> str | None:
-    return arrays.non_finite({key: tensors[key] for key in tensors if key != "frames"})
-
-
-def _check_manifest(manifest: Mapping[str, Any], path: Path) -> None:
-    """Check what :class:`Dataset` relies on; shard names must not leave the directory."""
-    try:
-        good = (
-            isinstance(manifest["plant"], str)
-            and isinstance(manifest["config"], dict)
-            and isinstance(manifest["config"].get("collect", {}), dict)
-            and isinstance(manifest["camera"], dict)
-            and manifest["frames"] in ("stored", "rendered")
-            and 0 < len(manifest["splits"].keys() & set(SPLITS)) == len(manifest["splits"])
-            and all(
-                type(split["steps"]) is int
-                and len(split["shards"]) > 0
-                and all(SHARD_NAME.fullmatch(shard["name"]) for shard in split["shards"])
-                and all(type(shard["trajectories"]) is int for shard in split["shards"])
-                and all(isinstance(shard["sha256"], str) for shard in split["shards"])
-                and split["trajectories"] == sum(n["trajectories"] for n in split["shards"])
-                and type(split["trajectories"]) is int
-                for split in manifest["splits"].values()
-            )
-        )
-    except (KeyError, TypeError, AttributeError):
-        good = False
-    if not good:
-        raise DataError(f"{path / MANIFEST} lacks fields or has malformed ones")
-
-
-def _refuse_foreign(directory: Path) -> None:
-    entries = files.list_names(directory)
-    if MANIFEST in entries:
-        load_dataset(directory)  # a foreign or damaged dataset.json says so itself
-        return
-    for name in entries:
-        ours = name in (files.LOCK_FILE, LOG) or SHARD_NAME.fullmatch(name)
-        if not ours and not files.is_temporary(name):
-            raise UsageError(
-                f"{directory} is not empty and not an hjepa dataset: it holds '{name}'",
-                hint="choose a new or empty directory with --out DIR",
-            )
-
-
-def _remove_shards(directory: Path) -> None:
-    """Delete the shards of a collection that was interrupted before its manifest."""
-    for name in files.list_names(directory):
-        if SHARD_NAME.fullmatch(name):
-            try:
-                (directory / name).unlink()
-            except OSError as error:
-                raise files.storage_error(directory / name, error) from None

@@ -26,26 +26,23 @@ from hjepa_cli.storage.files import write_bytes
 TOGETHER = 20  # trajectories rendered and written at a time
 
 Frames = Callable[[Trajectories], np.ndarray]
-"""Trajectories → their frames uint8 [N, T + 1, H, W, 3]."""
+"""It renders trajectories: uint8 [N, T + 1, H, W, 3]."""
 
 
 def columns(
     split: Trajectories, first_teacher_n: np.ndarray, force_limit_n: float
 ) -> dict[str, np.ndarray]:
-    """All columns but ``pixels``.
-
-    Args:
-        split: N trajectories.
-        first_teacher_n: the teacher's forces [N, *A] before k = 0, which are not stored.
-        force_limit_n: what actions are divided by.
-    """
+    """Return all columns but ``pixels``; ``first_teacher_n`` [N, *A] is from before k = 0."""
     count, rows = split.states.shape[:2]
-    applied_n = np.concatenate([np.zeros_like(first_teacher_n)[:, None], split.applied_n], axis=1)
-    teacher_n = np.concatenate([first_teacher_n[:, None], split.teacher_n], axis=1)
+
+    def actions(first_n: np.ndarray, forces_n: np.ndarray) -> np.ndarray:
+        joined_n = np.concatenate([first_n[:, None], forces_n], axis=1)
+        return (joined_n / force_limit_n).astype(np.float32).reshape(count * rows, -1)
+
     return {
         "state": split.states.reshape(count * rows, -1),
-        "action": (applied_n / force_limit_n).astype(np.float32).reshape(count * rows, -1),
-        "teacher_action": (teacher_n / force_limit_n).astype(np.float32).reshape(count * rows, -1),
+        "action": actions(np.zeros_like(first_teacher_n), split.applied_n),
+        "teacher_action": actions(first_teacher_n, split.teacher_n),
         "ep_len": np.full(count, rows, np.int32),
         "ep_offset": np.arange(count, dtype=np.int64) * rows,
     }
@@ -57,15 +54,11 @@ def write_hdf5(
     pixels: Iterator[np.ndarray] | None,
     frame_shape: tuple[int, ...],
     about: dict[str, Any],
-) -> Path:
+) -> None:
     """Write the columns as one HDF5 file, atomically; equal data give equal bytes.
 
-    Args:
-        path: the file to replace.
-        values: of :func:`columns`.
-        pixels: blocks of frames [n, H, W, 3] in row order; ``None`` leaves the column out.
-        frame_shape: (H, W, 3).
-        about: plain JSON data, kept as the attribute ``hjepa``.
+    ``pixels`` are blocks of frames [n, H, W, 3] in row order, or ``None`` to leave the column out;
+    ``frame_shape`` is (H, W, 3), ``about`` plain JSON data for the attribute ``hjepa``.
 
     Raises:
         MissingInputError: h5py is not installed.
@@ -79,22 +72,23 @@ def write_hdf5(
             hint='pip install "hjepa[hdf5]", or --format npz',
         ) from None
     buffer = io.BytesIO()
-    with h5py.File(buffer, "w", libver="latest") as file:
+    # Later layouts are read by the newest libraries alone; peers append, which needs no last row.
+    with h5py.File(buffer, "w", libver=("v110", "v110")) as file:
         for name, array in values.items():
-            file.create_dataset(name, data=array)
+            file.create_dataset(name, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
         if pixels is not None:
             shape = (len(values["state"]), *frame_shape)
             # A frame per chunk, as peers read single rows; gzip makes it 50 times smaller.
             column = file.create_dataset(
-                "pixels", shape, np.uint8, chunks=(1, *frame_shape), compression=1
-            )
+                "pixels", shape, np.uint8, maxshape=(None, *frame_shape),
+                chunks=(1, *frame_shape), compression=1,
+            )  # fmt: skip
             start = 0
             for block in pixels:
                 column[start : start + len(block)] = block
                 start += len(block)
         file.attrs["hjepa"] = json.dumps(about, sort_keys=True)
     write_bytes(path, buffer.getvalue())
-    return path
 
 
 def write_npz(
@@ -102,19 +96,18 @@ def write_npz(
     values: dict[str, np.ndarray],
     pixels: Iterator[np.ndarray] | None,
     about: dict[str, Any],
-) -> Path:
+) -> None:
     """Write the columns as one compressed NPZ file, atomically; equal data give equal bytes."""
-    arrays = dict(values)
+    arrays: dict[str, Any] = {"hjepa": np.array(json.dumps(about, sort_keys=True)), **values}
     if pixels is not None:
         arrays["pixels"] = np.concatenate(list(pixels))
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, hjepa=np.array(json.dumps(about, sort_keys=True)), **arrays)
+    np.savez_compressed(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
-    return path
 
 
 def blocks(split: Trajectories, frames: Frames, tick: Callable[[int], None]) -> Iterator[Any]:
-    """Frames of a split in row order, some trajectories at a time: [n, H, W, 3]."""
+    """Yield frames of a split in row order, some trajectories at a time: [n, H, W, 3]."""
     for start in range(0, len(split), TOGETHER):
         part = split[start : start + TOGETHER]
         images = frames(part)

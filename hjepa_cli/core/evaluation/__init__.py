@@ -1,1 +1,1 @@
-"""What is measured of closed loops, and what follows for a cell."""
+"""Evaluation measures closed loops, and counts what follows for a cell."""

@@ -2,36 +2,40 @@
 
 ``curves.json`` holds one entry per method, exactly as ``eval --json`` prints it, under a digest of
 the checkpoint, of the protocol and of the code's version of the closed loop. An entry is reused
-where all three agree, and of an anchor where it was fitted to the same trajectories besides;
-otherwise it counts as not there.
+where all three agree, of a method that is fitted to trajectories where they are the same besides,
+and of a plugin's method where the plugin is; otherwise it counts as not there.
 """
 
 import contextlib
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+import itertools
+import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from hjepa_cli.config.checks import ANCHORS
-from hjepa_cli.config.settings import Settings
+import msgspec
+
+from hjepa_cli.config.checks import LATE
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.loop import LOOP_VERSION
-from hjepa_cli.core.evaluation.protocol import BESIDE
 from hjepa_cli.core.plants.conditions import altered
 from hjepa_cli.core.plants.named import definition
-from hjepa_cli.errors import DataError, HjepaError
-from hjepa_cli.storage import files
+from hjepa_cli.errors import DataError, HjepaError, Unsealed
+from hjepa_cli.plugins import CODECS, METHODS
+from hjepa_cli.storage import files, seals
 from hjepa_cli.storage.runs import ROOT
-from hjepa_cli.storage.zoo import CURVES_FILE
+from hjepa_cli.storage.zoo import CURVES_FILE, CURVES_SCHEMA
 
-SCHEMA = 1
+SCHEMA = CURVES_SCHEMA
 AGAIN = "measure them again with --remeasure, or delete the file"
+LONGEST_STEPS = 1e6  # a gap between packets
 
 Entry = dict[str, Any]
 
-Check = Callable[[Any], bool]
-
-LARGEST = 1e12  # beyond anything that is measured; keeps arithmetic in range
+LARGEST = 1e12
+ROUNDING = 1e-9  # sums of a bootstrap are in another order
 RANGES = ("x_m", "x_dot_m_s", "theta_rad", "theta_dot_rad_s")  # of starts, in ``collect``
 CLEAN = ("clean_trajectories", "clean_steps", *RANGES)  # what clean rollouts depend on
 FITTED = ("trajectories", "test_trajectories", "steps", "exploration_n", "exploration_hold_steps")
@@ -39,19 +43,11 @@ FITTED = ("trajectories", "test_trajectories", "steps", "exploration_n", "explor
 
 @dataclasses.dataclass(frozen=True)
 class Digest:
-    """What curves were measured with.
+    """It stands for all that curves were measured with."""
 
-    Attributes:
-        checkpoint: sha256 of the model; ``None`` without one (true-state methods alone).
-        protocol: sha256 of everything else that a user can set.
-        fitted: sha256 of what the trajectories depend on that anchors are fitted to, beside the
-            settings in ``protocol``. It concerns these methods alone.
-        loop_version: :data:`hjepa_cli.core.control.loop.LOOP_VERSION`.
-    """
-
-    checkpoint: str | None
-    protocol: str
-    fitted: str = ""
+    checkpoint: str | None  # sha256 of the model; None without one (true-state methods alone)
+    protocol: str  # sha256 of everything else that a user can set
+    fitted: str = ""  # besides, of what trajectories depend on, for the methods fitted to them
     loop_version: int = LOOP_VERSION
 
     @classmethod
@@ -61,13 +57,10 @@ class Digest:
         settings: Settings,
         dataset: Mapping[str, Any] | None = None,
     ) -> "Digest":
-        """Digest for a checkpoint, the settings that matter, and the rollouts behind the NMAE.
+        """Digest a checkpoint, the settings that matter, and the rollouts behind the NMAE.
 
-        Args:
-            checkpoint: the model's sha256.
-            settings: plant, seed, protocol, embedding and clean rollouts count.
-            dataset: settings of the dataset whose clean rollouts are used, if any. One that was
-                collected as the settings say gives the same rollouts, and the same digest.
+        ``dataset`` has the settings of the one whose rollouts are used, if any. One that was
+        collected as ``settings`` say gives the same rollouts, and the same digest.
 
         Raises:
             DataError: the dataset does not say how its clean rollouts were made.
@@ -101,12 +94,15 @@ class Digest:
         fitted = [values["collect"][key] for key in FITTED]
         if _starts(values["collect"]) != starts:  # the dataset's are in ``clean``, these nowhere
             fitted.append(_starts(values["collect"]))
-        if values["protocol"]["payload"].startswith("pca"):  # components are fitted to them, too
+        payload = settings.protocol.payload
+        if CODECS[payload].fitted:
             measured["fitted"] = fitted
+        if plugin := CODECS.source(payload):
+            measured["codec"] = plugin.sha256
         return cls(checkpoint, _sha256(measured), _sha256(fitted))
 
     def as_dict(self) -> dict[str, Any]:
-        """As it stands in a file, for all of its methods."""
+        """Return it as it stands in a file, for all of its methods."""
         return {name: value for name, value in vars(self).items() if name != "fitted"}
 
 
@@ -114,32 +110,33 @@ def _starts(collected: Mapping[str, Any]) -> list[Any]:
     return [*(collected[key] for key in RANGES), *collected.get("start", [])]
 
 
-def read(path: Path, digest: Digest) -> dict[str, Entry]:
+def read(path: Path, digest: Digest, *, named: bool = False) -> dict[str, Entry]:
     """Return the entries in ``path`` by method; none if it is not there or of another digest.
 
+    A file from before there were seals is no cache: without a seal there are none either, and an
+    :class:`~hjepa_cli.errors.Unsealed` warning, unless a person ``named`` it.
+
     Raises:
-        DataError: not a file of curves.
-        StorageError: the disk refused.
+        DataError: not a file of curves, or changed after it was written.
     """
     if not path.exists():
         return {}
-    try:
-        document = files.read_json(path)
-    except DataError as error:
-        error.hint = AGAIN
-        raise
-    files.check_schema(document.get("schema"), SCHEMA, str(path))
-    if not isinstance(document.get("methods"), dict):
-        raise _damaged(path, "no methods")
-    if document.get("digest") != digest.as_dict():
+    document = seals.read(path, SCHEMA, AGAIN)
+    methods, of = document.get("methods"), document.get("digest")
+    if not (isinstance(methods, dict) and isinstance(of, dict)):
+        raise DataError(f"{path} holds no valid curves: no methods or no digest", hint=AGAIN)
+    for name, entry in methods.items():
+        if reason := flaw(entry, complete=of.get("loop_version") == LOOP_VERSION):
+            raise DataError(f"{path} holds no valid curves: method '{name}': {reason}", hint=AGAIN)
+    if of != digest.as_dict():
         return {}
-    for name, entry in document["methods"].items():
-        if reason := flaw(entry, complete=digest.loop_version == LOOP_VERSION):
-            raise _damaged(path, f"method '{name}': {reason}")
+    if seals.SEAL not in document and not named:
+        seals.warn(path, "its curves are not used; --remeasure replaces them")
+        return {}
     return {
         name: entry
         for name, entry in document["methods"].items()
-        if name not in ANCHORS or entry.get("fitted_to") == digest.fitted
+        if _depends_on(name, digest).items() <= entry.items()
     }
 
 
@@ -148,156 +145,153 @@ def find(
 ) -> dict[str, tuple[Entry, Path]]:
     """Look for methods in ``places``, then in the runs of ``eval`` and ``scale``, newest first.
 
+    Damaged files of old runs are passed over, those of ``places`` are a DataError.
+
     Returns:
         Entry and the file it came from, for the methods that were found.
-
-    Raises:
-        DataError: a file of ``places`` is damaged; damaged files of old runs are passed over.
-        StorageError: the disk refused.
     """
-    missing = list(methods)
-    found: dict[str, tuple[Entry, Path]] = {}
+    wanted, found = list(methods), dict[str, tuple[Entry, Path]]()
 
     def take(path: Path) -> None:
-        entries = read(path, digest)
-        for name in [name for name in missing if name in entries]:
-            found[name] = (entries[name], path)
-            missing.remove(name)
+        for name, entry in read(path, digest).items():
+            if name in wanted:
+                found.setdefault(name, (entry, path))
 
     for path in places:
         take(path)
-    for path in _newest_first(root / "eval", root / "scale") if missing else []:
-        with contextlib.suppress(HjepaError):
+    if found.keys() >= set(wanted):
+        return found
+    pattern = f"*/{Path(CURVES_FILE).stem}*.json"
+    old = [path for stage in ("eval", "scale") for path in (root / stage).glob(pattern)]
+    old = [path for path in old if path.is_file()]
+    for path in sorted(old, key=lambda path: path.stat().st_mtime_ns, reverse=True):
+        with contextlib.suppress(HjepaError), warnings.catch_warnings():
+            warnings.simplefilter("ignore", Unsealed)
             take(path)
     return found
 
 
+def _depends_on(name: str, digest: Digest) -> dict[str, str]:
+    """Return what a method's entry must say beside the digest of its file."""
+    method = name.partition(LATE)[0]
+    if method not in METHODS:  # of a plugin that is not in force: kept, as nobody can ask for it
+        return {}
+    fitted = {"fitted_to": digest.fitted} if METHODS[method].fitted else {}
+    source = METHODS.source(method)
+    return fitted | ({"plugin": source.sha256} if source else {})
+
+
 def further_file(digest: Digest) -> str:
-    """The file in a run for curves of another model than the first one."""
+    """Name the file in a run for curves of another model than the first one."""
     return f"{Path(CURVES_FILE).stem}-{(digest.checkpoint or '')[:12]}.json"
 
 
 def write(path: Path, digest: Digest, entries: Mapping[str, Entry]) -> None:
-    """Add entries to ``path``, keeping those of the same digest, replacing all others.
-
-    Raises:
-        StorageError: the disk refused; the file is what it was before.
-    """
+    """Add entries to ``path``, keeping those of the same digest, replacing all others."""
     with files.taking_turns(path.parent):  # two evaluations may share a model's file
         kept: dict[str, Entry] = {}
-        with contextlib.suppress(DataError):  # damaged curves are replaced like foreign ones
-            kept = read(path, digest)
+        with contextlib.suppress(DataError), warnings.catch_warnings():
+            warnings.simplefilter("ignore", Unsealed)
+            kept = read(path, digest)  # damaged and unsealed curves are replaced like foreign ones
         methods = files.jsonable(kept | dict(entries))
-        for name in methods.keys() & set(ANCHORS):
-            methods[name]["fitted_to"] = digest.fitted
+        for name, entry in methods.items():
+            entry.update(_depends_on(name, digest))
         document = {"schema": SCHEMA, "digest": digest.as_dict(), "methods": methods}
-        files.write_json(path, document)
+        files.write_json(path, seals.sealed(document))
 
 
 def _sha256(value: object) -> str:
     return hashlib.sha256(files.canonical_json(value).encode()).hexdigest()
 
 
-def _newest_first(*stages: Path) -> list[Path]:
-    """The curve files of these stages' runs."""
-    runs = (stage / name for stage in stages for name in files.list_names(stage))
-    paths = (path for run in runs for path in run.glob(f"{Path(CURVES_FILE).stem}*.json"))
-    return sorted(
-        (path for path in paths if path.is_file()),
-        key=lambda path: path.stat().st_mtime_ns,
-        reverse=True,
-    )
+def flaw(entry: Any, *, complete: bool = False) -> str | None:
+    """Return what keeps an entry from being used, if anything.
 
-
-def flaw(entry: object, *, complete: bool = False) -> str | None:
-    """Say what keeps an entry from being used, if anything.
-
-    Args:
-        entry: of a method, as read from a file.
-        complete: it is of the present version, and must have all that came later too.
+    A ``complete`` one is of the present version, and must have all that came later too.
     """
-    if not isinstance(entry, dict):
-        return "not an object"
-    for key, check in (_CHECKS | _LATER).items():
-        if key not in entry:
-            if key in _LATER and not complete:
-                continue
-            return f"'{key}' is missing"
-        if not check(entry[key]):
-            return f"'{key}' is {str(entry[key])[:40]!r}"
-    return None
+    try:
+        found = msgspec.convert(entry, _Measured)
+    except msgspec.ValidationError as error:
+        return str(error)
+    if len(found.nmae) != len(found.nmae_ci95):
+        return f"{len(found.nmae)} values of 'nmae' and {len(found.nmae_ci95)} of 'nmae_ci95'"
+    inside = [
+        ("score", found.score, found.score_ci95),
+        ("tolerance_gap_steps", found.tolerance_gap_steps, found.tolerance_gap_ci95),
+        ("tolerance_p", found.tolerance_p, found.tolerance_p_ci95),
+        ("nmae_every_step", found.nmae_every_step, found.nmae_every_step_ci95),
+        *(("nmae", *pair) for pair in zip(found.nmae, found.nmae_ci95, strict=True)),
+        *(("a point of a curve", point.score, point.ci95) for point in found.points()),
+    ]
+    for name, value, interval in inside:
+        low, high = interval or (None, None)
+        if value is not None and low is not None and high is not None:
+            slack = ROUNDING * max(1.0, abs(value))
+            if not (low <= high and low - slack <= value <= high + slack):
+                return f"'{name}' is {value:.6g}, its interval {low:.6g} … {high:.6g}"
+    known = (field.name for field in msgspec.structs.fields(_Measured) if complete)
+    missing = (name for name in known if name not in entry and not name.endswith("_bracket"))
+    return next((f"'{name}' is missing" for name in missing), None)
 
 
-def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and abs(value) <= LARGEST  # type: ignore[arg-type]
+# Bounds beyond anything that is measured keep arithmetic in range.
+_Number = Annotated[float, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
+_NotNegative = Annotated[float, msgspec.Meta(ge=0, le=LARGEST)]
+_Count = Annotated[int, msgspec.Meta(ge=1, le=int(LARGEST))]
+_CountOr0 = Annotated[int, msgspec.Meta(ge=0, le=int(LARGEST))]
+_Interval = tuple[_Number, _Number]
+_Gap = Annotated[float, msgspec.Meta(ge=0, le=LONGEST_STEPS)]
+_Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
-def _is_count(value: object) -> bool:
-    return type(value) is int and 0 < value <= LARGEST
+class _GapPoint(msgspec.Struct):
+    d: _Gap
+    score: _NotNegative
+    ci95: tuple[_Number | None, _Number | None] | None = None
 
 
-def _is_flag(value: object) -> bool:
-    return isinstance(value, bool)
+class _DeliveryPoint(msgspec.Struct):
+    p: _Share
+    score: _NotNegative
+    ci95: tuple[_Number | None, _Number | None] | None = None
 
 
-def _is_tolerance(value: object) -> bool:
-    return value is None or (_is_number(value) and value >= 0)  # type: ignore[operator]
+class _Measured(msgspec.Struct, kw_only=True):
+    """It is what ``eval --json`` prints of a method; older results lack what has a default."""
 
+    score: _NotNegative
+    score_ci95: _Interval
+    lq_ratio: _Number
+    nmae: list[_NotNegative]
+    nmae_ci95: list[_Interval]
+    nmae_windows: dict[str, _Number | None]
+    gap_curve: list[_GapPoint]
+    delivery_curve: list[_DeliveryPoint]
+    tolerance_gap_steps: _Gap | None
+    tolerance_gap_ci95: _Interval | None
+    tolerance_gap_censored: bool | None
+    tolerance_gap_lq_steps: _Gap | None
+    tolerance_p: _Share | None
+    tolerance_p_ci95: _Interval | None
+    tolerance_p_censored: bool | None
+    bits_per_transmission: _CountOr0 | None
+    n_devices: _Count
+    n_curve_devices: _Count
+    n_rollouts: _Count
+    nmae_every_step: _Number = 0.0
+    nmae_every_step_ci95: _Interval = (0.0, 0.0)
+    tolerance_gap_in_band: _Share | None = None
+    tolerance_gap_lq_ratio: _Number | None = None
+    tolerance_gap_lost: _Share | None = None
+    tolerance_p_in_band: _Share | None = None
+    tolerance_p_lq_ratio: _Number | None = None
+    tolerance_p_lost: _Share | None = None
+    warmup_steps: _CountOr0 = 0
+    scored_steps: _Count = 1
+    gap_bracket: list[_GapPoint] = []
+    delivery_bracket: list[_DeliveryPoint] = []
 
-def _is_numbers(value: object) -> bool:
-    return isinstance(value, list) and all(map(_is_number, value))
-
-
-def _is_interval(value: object) -> bool:
-    return _is_numbers(value) and len(value) == 2  # type: ignore[arg-type]
-
-
-def _is_curve(value: object) -> bool:
-    """Points with a gap ``d`` or a probability ``p``, and a score."""
-    return isinstance(value, list) and all(
-        isinstance(point, dict)
-        and _is_number(point.get("score"))
-        and _is_number(point.get("d", point.get("p")))
-        for point in value
-    )
-
-
-def _or_none(check: Check) -> Check:
-    return lambda value: value is None or check(value)
-
-
-_CHECKS: dict[str, Check] = {
-    "score": _is_number,
-    "score_ci95": _is_interval,
-    "lq_ratio": _is_number,
-    "nmae": _is_numbers,
-    "nmae_ci95": lambda value: isinstance(value, list) and all(map(_is_interval, value)),
-    "nmae_windows": lambda value: (
-        isinstance(value, dict) and all(_or_none(_is_number)(entry) for entry in value.values())
-    ),
-    "gap_curve": _is_curve,
-    "delivery_curve": _is_curve,
-    "tolerance_gap_steps": _is_tolerance,
-    "tolerance_gap_ci95": _or_none(_is_interval),
-    "tolerance_gap_censored": _or_none(_is_flag),
-    "tolerance_gap_lq_steps": _is_tolerance,
-    "tolerance_p": _is_tolerance,
-    "tolerance_p_ci95": _or_none(_is_interval),
-    "tolerance_p_censored": _or_none(_is_flag),
-    "bits_per_transmission": lambda value: value is None or value == 0 or _is_count(value),
-    "n_devices": _is_count,
-    "n_curve_devices": _is_count,
-    "n_rollouts": _is_count,
-}
-
-_LATER: dict[str, Check] = {  # older results of eval are without these
-    "nmae_every_step": _is_number,
-    "nmae_every_step_ci95": _is_interval,
-    **{f"tolerance_{kind}_{key}": _or_none(_is_number) for kind in ("gap", "p") for key in BESIDE},
-    "warmup_steps": lambda value: type(value) is int and 0 <= value <= LARGEST,
-    "scored_steps": _is_count,
-}
-
-
-def _damaged(path: Path, reason: str) -> DataError:
-    return DataError(f"{path} holds no valid curves: {reason}", hint=AGAIN)
+    def points(self) -> Iterable[_GapPoint | _DeliveryPoint]:
+        return itertools.chain(
+            self.gap_curve, self.delivery_curve, self.gap_bracket, self.delivery_bracket
+        )

@@ -1,4 +1,4 @@
-"""How many loops one resource block carries under a scheduler, found by simulating it.
+"""Simulation finds how many loops one resource block carries under a scheduler.
 
 The load of a block is devices per transmission and slot. A light load is simulated on several
 blocks at once, so that every point has about as many devices.
@@ -13,6 +13,7 @@ import numpy as np
 from hjepa_cli.core import statistics
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.evaluation.cell_simulation import CellOutcome
+from hjepa_cli.core.radio.laws.scheduled import SupportedLoad
 
 BLOCK_DEVICES = 200  # simulated at a time, about
 MAX_LOAD = 512
@@ -23,13 +24,9 @@ MAX_WIDENINGS = 3
 
 @dataclasses.dataclass(frozen=True)
 class LoadPoint:
-    """One simulated load.
+    """Holds one simulated load: devices per block, J blocks, and what came of the N devices.
 
-    Attributes:
-        load: devices per block; whole where a search asks for it.
-        blocks: J.
-        outcome: of ``load · blocks`` devices.
-        reference: the teacher's score of the same devices [N].
+    ``reference`` is the teacher's score of the same devices [N].
     """
 
     load: float
@@ -39,51 +36,28 @@ class LoadPoint:
 
     @property
     def score(self) -> float:
-        """Normalised score."""
+        """Return the normalised score."""
         return float(statistics.ratio(self.outcome.score, self.reference))
 
     @property
     def packets_per_slot(self) -> float:
-        """Delivered per block and slot."""
+        """Return the packets delivered per block and slot."""
         return float(self.outcome.packets.sum()) / (self.blocks * self.outcome.counted_slots)
 
     @property
     def reports_per_slot(self) -> float:
-        """Innovation reports per block and slot."""
+        """Return the innovation reports per block and slot."""
         return self.outcome.reports / (self.blocks * self.outcome.counted_slots)
 
 
-@dataclasses.dataclass(frozen=True)
-class SupportedLoad:
-    """The load at which the score falls to the acceptable one.
-
-    Attributes:
-        load: devices per block, interpolated between the simulated ones; 0 where not even a block
-            per device suffices.
-        interval: 95 %, over devices of one seed or over seeds.
-        at_least: still acceptable at the largest load tried.
-        packets_per_slot, reports_per_slot: per block, at the nearest load inside.
-        points: (load, score) as simulated, ascending.
-        parts: of each seed, where this is an average over seeds.
-    """
-
-    load: float
-    interval: tuple[float, float]
-    at_least: bool
-    packets_per_slot: float
-    reports_per_slot: float
-    points: tuple[tuple[float, float], ...]
-    parts: tuple["SupportedLoad", ...] = ()
-
-
 def blocks_for(load: float) -> int:
-    """J, so that about :data:`BLOCK_DEVICES` devices are simulated."""
+    """Return J, so that about :data:`BLOCK_DEVICES` devices are simulated."""
     return max(1, int(BLOCK_DEVICES // load))
 
 
 def find_load(
     simulate: Callable[[int], LoadPoint],
-    level: float,
+    acceptable_score: float,
     bracket: float,
     *,
     replicates: int,
@@ -95,9 +69,8 @@ def find_load(
     Where an end of the interval lies beyond the loads of the search, others are simulated there.
 
     Args:
-        simulate: a load in 1 … :data:`MAX_LOAD`.
-        level: the acceptable score.
-        bracket: relative width at which to stop.
+        simulate: simulates a load in 1 … :data:`MAX_LOAD`.
+        acceptable_score, bracket: to stay at, and the relative width at which to stop.
         replicates, seed: of the bootstrap over devices. It takes devices as independent; they share
             blocks, so that several seeds say more.
         start: a load near the one to find, like that of another seed: fewer to simulate.
@@ -117,7 +90,7 @@ def find_load(
         if not middle:
             break
         points[middle] = simulate(middle)
-        if points[middle].score < level:
+        if points[middle].score < acceptable_score:
             high = min(middle, high)
         else:
             low = max(middle, low)
@@ -125,16 +98,25 @@ def find_load(
         if both and (high - low <= 1 or high / low <= 1 + bracket):
             break
 
-    def crossings() -> tuple[float, float, float]:
-        return _crossings([points[load] for load in sorted(points)], level, replicates, seed)
-
-    for _ in range(MAX_WIDENINGS):
-        crossing, least, most = crossings()
+    for remaining in range(MAX_WIDENINGS, -1, -1):
+        ascending = [points[load] for load in sorted(points)]
+        crossing, least, most = _crossings(ascending, acceptable_score, replicates, seed)
         outside = [round(min(points) / WIDER)] * math.isinf(least)
         outside += [round(max(points) * WIDER)] * math.isinf(most)
         outside = [load for load in outside if math.isfinite(crossing) and 1 <= load <= MAX_LOAD]
+        if not outside or not remaining:
+            break
         points |= {load: simulate(load) for load in outside}
-    return _supported([points[load] for load in sorted(points)], *crossings())
+    inside = [point for point in ascending if point.load <= crossing] or ascending[:1]
+    ends = {-math.inf: 0.0, math.inf: float(ascending[-1].load)}  # numbers that can be multiplied
+    return SupportedLoad(
+        load=ends.get(crossing, crossing),
+        interval=(ends.get(least, least), ends.get(most, most)),
+        at_least=crossing == math.inf,
+        packets_per_slot=inside[-1].packets_per_slot,
+        reports_per_slot=inside[-1].reports_per_slot,
+        points=tuple((point.load, point.score) for point in ascending),
+    )
 
 
 def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
@@ -157,7 +139,7 @@ def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
 def pooled_score(
     points: Sequence[LoadPoint], replicates: int, seed: int
 ) -> tuple[float, tuple[float, float]]:
-    """Normalised score of one load over the devices of all seeds, with its 95 % interval."""
+    """Return the normalised score of a load over devices of all seeds, and its 95 % interval."""
     score = np.concatenate([point.outcome.score for point in points])
     reference = np.concatenate([point.reference for point in points])
     weights = statistics.bootstrap_weights(len(score), replicates, seed)
@@ -166,41 +148,23 @@ def pooled_score(
 
 
 def _crossings(
-    points: Sequence[LoadPoint], level: float, replicates: int, seed: int
+    points: Sequence[LoadPoint], acceptable_score: float, replicates: int, seed: int
 ) -> tuple[float, float, float]:
     """Interpolate the load between the simulated ones; the 95 % interval over devices.
 
-    −∞ and ∞ where the score is below the level at the least load, above it at the largest.
+    −∞ and ∞ where the score is not acceptable at the least load, and acceptable at the largest.
     """
     loads = np.array([point.load for point in points], np.float64)
     scores = np.array([point.score for point in points])
     most = max(len(point.reference) for point in points)
     weights = statistics.bootstrap_weights(most, replicates, seed)
-    drawn = np.stack(
-        [
-            statistics.ratio(
-                point.outcome.score, point.reference, weights[:, : len(point.reference)]
-            )
-            for point in points
-        ],
-        axis=-1,
+    drawn = [
+        statistics.ratio(point.outcome.score, point.reference, weights[:, : len(point.reference)])
+        for point in points
+    ]
+    crossing, crossings = (
+        statistics.first_crossing(loads, each, acceptable_score, log=False)
+        for each in (scores, np.stack(drawn, axis=-1))
     )
-    crossing = statistics.first_crossing(loads, scores, level, log=False)
-    low, high = statistics.interval(statistics.first_crossing(loads, drawn, level, log=False))
+    low, high = statistics.interval(crossings)
     return float(crossing), float(low), float(high)
-
-
-def _supported(
-    points: Sequence[LoadPoint], crossing: float, low: float, high: float
-) -> SupportedLoad:
-    """What was found between the simulated loads, in numbers that can be multiplied."""
-    inside = [point for point in points if point.load <= crossing] or points[:1]
-    ends = {-math.inf: 0.0, math.inf: float(points[-1].load)}
-    return SupportedLoad(
-        load=ends.get(crossing, crossing),
-        interval=(ends.get(low, low), ends.get(high, high)),
-        at_least=crossing == math.inf,
-        packets_per_slot=inside[-1].packets_per_slot,
-        reports_per_slot=inside[-1].reports_per_slot,
-        points=tuple((point.load, point.score) for point in points),
-    )

@@ -1,4 +1,4 @@
-"""The measuring protocol: curves over the gap and over the delivery probability, and tolerances.
+"""The protocol measures curves over the gap and over the delivery probability, and tolerances.
 
 A curve is measured on a grid with few devices; where it crosses the acceptable score it is
 measured again with more, until the crossing is bracketed to a few per cent.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hjepa_cli.config.settings import ProtocolSettings
+from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core import statistics
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.loop import Draws, Outcome, delivery_schedule, gap_schedule
@@ -27,7 +27,7 @@ MAX_GUESSES = 4  # rounds of a search that go by guessing, before it bisects
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """One point of a curve: a link with mean gap ``gap`` between packets, in steps.
+    """Is one point of a curve: a link with mean gap ``gap`` between packets, in steps.
 
     Attributes:
         kind: ``"gap"``: every D = ``gap`` steps; ``"delivery"``: with p = 1/``gap`` at each.
@@ -37,23 +37,19 @@ class Point:
     gap: float
 
     def schedule(self, draws: Draws) -> NDArray[np.bool_]:
-        """When packets arrive: bool [steps, N]."""
+        """Return when packets arrive: bool [steps, N]."""
         if self.kind == "gap":
             return gap_schedule(self.gap, draws.steps, draws.devices)
         return delivery_schedule(1 / self.gap, draws.delivery)
 
     def coordinate(self) -> dict[str, float]:
-        """``{"d": D}`` or ``{"p": p}``, as curves are printed."""
+        """Return ``{"d": D}`` or ``{"p": p}``, as curves are printed."""
         return {"d": self.gap} if self.kind == "gap" else {"p": 1 / self.gap}
-
-
-Measure = Callable[[Sequence[Point], int], Outcome]
-"""Simulates points with the first ``devices`` draws: outcome arrays [P, devices]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reference:
-    """The teacher, acting on the true state at every step, on the same draws.
+    """Holds the teacher, acting on the true state at every step, on the same draws.
 
     Attributes:
         score, cost: [N], all bracket devices.
@@ -65,22 +61,15 @@ class Reference:
     replicates: int
     seed: int
 
-    def weights(self, devices: int) -> Floats:
-        """Bootstrap weights [B, devices], the same whenever asked."""
-        return statistics.bootstrap_weights(devices, self.replicates, self.seed)
-
     def relative_score(self, outcome: Outcome) -> Floats:
-        """Normalised score of each point [P]."""
+        """Return the normalised score of each point [P]."""
         return statistics.ratio(outcome.score, self.score[: outcome.score.shape[1]])
 
     def score_replicates(self, outcome: Outcome) -> Floats:
-        """Bootstrap replicates of the normalised score [B, P]."""
+        """Return bootstrap replicates of the normalised score [B, P]."""
         devices = outcome.score.shape[1]
-        return statistics.ratio(outcome.score, self.score[:devices], self.weights(devices))
-
-    def relative_cost(self, outcome: Outcome) -> Floats:
-        """LQ ratio of each point [P]: J of the teacher ÷ J of the method."""
-        return np.asarray(self.cost[: outcome.cost.shape[1]].mean() / outcome.cost.mean(axis=1))
+        weights = statistics.bootstrap_weights(devices, self.replicates, self.seed)
+        return statistics.ratio(outcome.score, self.score[:devices], weights)
 
     def describe(self, points: Sequence[Point], outcome: Outcome) -> list[dict[str, Any]]:
         """Return curve entries as printed.
@@ -90,16 +79,17 @@ class Reference:
         """
         scores = self.relative_score(outcome)
         low, high = statistics.interval(self.score_replicates(outcome))
-        costs = self.relative_cost(outcome)
+        devices = outcome.score.shape[1]
+        lq_ratios = self.cost[:devices].mean() / outcome.cost.mean(axis=1)
         return [
             {
                 **point.coordinate(),
                 "score": float(scores[i]),
                 "ci95": [float(low[i]), float(high[i])],
                 "in_band": float(outcome.score[i].mean()),
-                "lq_ratio": float(costs[i]),
+                "lq_ratio": float(lq_ratios[i]),
                 "lost": float(outcome.lost[i].mean()),
-                "n_devices": outcome.score.shape[1],
+                "n_devices": devices,
             }
             for i, point in enumerate(points)
         ]
@@ -107,12 +97,10 @@ class Reference:
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
-    """How sparse packets may get before the score falls below the acceptable one.
+    """Tells how sparse packets may get before the score falls below the acceptable one.
 
-    Attributes:
-        gap: mean gap in steps; 0 where not even a packet at every step suffices, the end of the
-            grid where the score is still acceptable there (``censored``).
-        interval: its 95 % interval, within the same two ends.
+    That is a mean gap in steps; 0 where not even a packet at every step suffices, the end of the
+    grid where the score is still acceptable there (``censored``). Its 95 % interval lies within.
     """
 
     gap: float
@@ -128,38 +116,36 @@ class Search:
     are many already, the grid has these, and the interval's ends lie on lines between its points.
 
     Args:
-        kind: see :class:`Point`.
-        grid: ascending mean gaps.
-        grid_scores: normalised scores of the grid with few devices.
+        grid: points of one kind, by ascending gap.
+        few: their outcomes with few devices.
         reference: the teacher with many devices.
-        protocol: acceptable score and bracket width.
+        protocol: acceptable score, bracket width and devices.
     """
 
     def __init__(
-        self,
-        kind: str,
-        grid: Sequence[float],
-        grid_scores: Floats,
-        reference: Reference,
-        protocol: ProtocolSettings,
+        self, grid: Sequence[Point], few: Outcome, reference: Reference, protocol: ProtocolSettings
     ) -> None:
-        self.kind = kind
-        self._grid = dict(zip(map(float, grid), grid_scores.tolist(), strict=True))
+        self.kind, self._log = grid[0].kind, grid[0].kind == "delivery"
+        scores = reference.relative_score(few).tolist()
+        self._grid = dict(zip((point.gap for point in grid), scores, strict=True))
         self._measured: dict[float, Outcome] = {}
         self._reference = reference
-        self._level, self._bracket = protocol.acceptable_score, protocol.bracket
+        self._acceptable, self._bracket = protocol.acceptable_score, protocol.bracket
         self._step_out = 1 + STEP_OUT * protocol.bracket
         self._rounds = 0
         self._steps_down = self._steps_up = 1
+        if protocol.curve_devices == protocol.bracket_devices:  # few devices are many already
+            for row, point in enumerate(grid):
+                self.add(point, few.part(slice(row, row + 1)))
 
     @property
     def points(self) -> list[Point]:
-        """The points measured so far, ascending."""
+        """Return the points measured so far, ascending."""
         return [Point(self.kind, gap) for gap in sorted(self._measured)]
 
     @property
     def outcome(self) -> Outcome:
-        """Their outcomes [P, N]."""
+        """Return their outcomes [P, N]."""
         return Outcome.joined([self._measured[gap] for gap in sorted(self._measured)], axis=0)
 
     def add(self, point: Point, outcome: Outcome) -> None:
@@ -167,7 +153,7 @@ class Search:
         self._measured[point.gap] = outcome
 
     def wanted(self) -> list[Point]:
-        """The next points to measure with many devices; none when the search is over."""
+        """Return the next points to measure with many devices; none when the search is over."""
         self._rounds += 1
         return [Point(self.kind, gap) for gap in self._next() if gap not in self._measured]
 
@@ -184,14 +170,16 @@ class Search:
             right = int(np.searchsorted(gaps, crossing))
             low = min(low, gaps[max(right - 1, 0)])
             high = max(high, gaps[min(right, len(gaps) - 1)])
-        return Tolerance(
-            self._bounded(crossing), (self._bounded(low), self._bounded(high)), crossing == math.inf
-        )
+        ends = {-math.inf: 0.0, math.inf: max(self._grid)}  # below at the first point, or never
+        gap, low, high = (ends.get(value, value) for value in (crossing, low, high))
+        return Tolerance(gap, (low, high), crossing == math.inf)
 
     def _next(self) -> Sequence[float]:
-        scores = self._best_known()
-        gaps = sorted(scores)
-        left, right = _bracket(gaps, [scores[gap] for gap in gaps], self._level)
+        scores = dict(self._grid)
+        if self._measured:
+            measured = self._reference.relative_score(self.outcome).tolist()
+            scores |= zip(sorted(self._measured), measured, strict=True)
+        left, right = _bracket(scores, self._acceptable)
         if left is not None and right is not None and right / left - 1 > self._bracket:
             return self._between(left, right, scores)
         ends = [end for end in (left, right) if end is not None and end not in self._measured]
@@ -210,13 +198,6 @@ class Search:
             wider.append(min(last * self._step_out ** (self._steps_up / 2), max(self._grid)))
         return wider
 
-    def _best_known(self) -> dict[float, float]:
-        """Scores by gap: with many devices where measured, else the grid's."""
-        if not self._measured:
-            return dict(self._grid)
-        scores = self._reference.relative_score(self.outcome)
-        return self._grid | dict(zip(sorted(self._measured), scores.tolist(), strict=True))
-
     def _interval(self) -> tuple[float, float]:
         replicates = self._cross(self._reference.score_replicates(self.outcome))
         low, high = statistics.interval(replicates)
@@ -224,14 +205,14 @@ class Search:
 
     def _cross(self, scores: Floats) -> Floats:
         gaps = np.array(sorted(self._measured))
-        return statistics.first_crossing(gaps, scores, self._level, log=self._log)
+        return statistics.first_crossing(gaps, scores, self._acceptable, log=self._log)
 
     def _between(self, left: float, right: float, scores: Mapping[float, float]) -> Sequence[float]:
-        """Where to cut a bracket that is too wide.
+        """Choose where to cut a bracket that is too wide.
 
-        First at the guessed crossing and as far to both sides as intervals usually reach; then
-        with two cuts, a bracket's width apart, around a better guess. In the middle where the
-        bracket is short, and when guessing has not helped.
+        That is at the guessed crossing and as far to both sides as intervals usually reach at
+        first; then at two places, a bracket's width apart, around a better guess; and in the middle
+        where the bracket is short, and when guessing has not helped.
         """
         width = 1 + self._bracket
         if self._rounds > MAX_GUESSES or right / left <= width**2:
@@ -246,7 +227,7 @@ class Search:
         return [gap for gap in (guess / half, guess * half) if left < gap < right]
 
     def _guess(self, left: float, right: float, scores: Mapping[float, float]) -> float:
-        """The crossing on a line: between the ends, unless just one of them is measured.
+        """Return the crossing on a line between the ends, unless just one of them is measured.
 
         Then the line goes through that one, with the grid's slope: few devices tell how steep a
         curve is better than how high.
@@ -255,53 +236,37 @@ class Search:
         to, back = (math.log, math.exp) if self._log else (float, float)
         through, drop = left, scores[left] - scores[right]
         if len(known) == 1:
-            through, drop = known[0], self._on_grid(left) - self._on_grid(right)
+            of_few = np.interp((left, right), list(self._grid), list(self._grid.values()))
+            through, drop = known[0], float(of_few[0] - of_few[1])
         if drop <= 0:
             return self._middle(left, right)
-        steps = (scores[through] - self._level) / drop
+        steps = (scores[through] - self._acceptable) / drop
         return back(min(to(through) + steps * (to(right) - to(left)), to(max(self._grid))))
-
-    def _on_grid(self, gap: float) -> float:
-        """The score that few devices have at any gap, interpolated."""
-        return float(np.interp(gap, list(self._grid), list(self._grid.values())))
 
     def _middle(self, left: float, right: float) -> float:
         return math.sqrt(left * right) if self._log else (left + right) / 2
 
-    def _bounded(self, gap: float) -> float:
-        """Below at the first point: 0; never below: the end of the grid."""
-        return {-math.inf: 0.0, math.inf: max(self._grid)}.get(gap, gap)
 
-    @property
-    def _log(self) -> bool:
-        return self.kind == "delivery"
-
-
-def _bracket(
-    gaps: Sequence[float], scores: Sequence[float], level: float
-) -> tuple[float | None, float | None]:
-    """The neighbouring gaps around the first fall below ``level``; ``None`` beyond the grid."""
-    for index, score in enumerate(scores):
-        if score < level:
-            return (gaps[index - 1] if index else None), gaps[index]
-    return gaps[-1], None
+def _bracket(scores: Mapping[float, float], acceptable: float) -> tuple[float | None, float | None]:
+    """Return the gaps around the first score that is not acceptable; ``None`` beyond the grid."""
+    left = None
+    for gap in sorted(scores):
+        if scores[gap] < acceptable:
+            return left, gap
+        left = gap
+    return left, None
 
 
 @dataclasses.dataclass(frozen=True)
 class Curves:
-    """One method under one protocol.
-
-    Attributes:
-        grid: outcomes on the grid by kind, few devices.
-        searches: finished searches by kind, many devices.
-    """
+    """Holds by kind one method's outcomes on the grid, of few devices, and searches, of many."""
 
     grid: dict[str, tuple[list[Point], Outcome]]
     searches: dict[str, Search]
 
 
 def measure_curves(
-    measure: Measure,
+    measure: Callable[[Sequence[Point], int], Outcome],
     every_step: Callable[[], Outcome],
     reference: Reference,
     protocol: ProtocolSettings,
@@ -309,11 +274,11 @@ def measure_curves(
     """Measure both curves of one method and search both tolerances, always in one batch.
 
     Args:
-        measure: simulates points of the method.
+        measure: simulates points with the first N draws: outcome arrays [P, N].
         every_step: waits for the method with a packet at every step (g = 1), [1, curve devices]:
             the first point of both curves, the same for all methods with one sensor and one actor.
         reference: the teacher with all bracket devices.
-        protocol: grid, devices, level and bracket.
+        protocol: grid, devices, acceptable score and bracket.
     """
     gaps = [float(gap) for gap in protocol.gaps]
     later = [Point(kind, gap) for kind in KINDS for gap in gaps[1:]]
@@ -325,11 +290,7 @@ def measure_curves(
         parts = [first, *([outcome.part(rows)] if outcome else [])]
         points, joined = [Point(kind, gap) for gap in gaps], Outcome.joined(parts, axis=0)
         grid[kind] = (points, joined)
-        search = Search(kind, gaps, reference.relative_score(joined), reference, protocol)
-        if protocol.curve_devices == protocol.bracket_devices:  # few devices are many already
-            for row, point in enumerate(points):
-                search.add(point, joined.part(slice(row, row + 1)))
-        searches[kind] = search
+        searches[kind] = Search(points, joined, reference, protocol)
     while wanted := [point for search in searches.values() for point in search.wanted()]:
         outcome = measure(wanted, protocol.bracket_devices)
         for row, point in enumerate(wanted):

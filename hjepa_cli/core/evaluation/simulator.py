@@ -1,4 +1,4 @@
-"""Closed-loop simulations by description: what to simulate is small, plain data.
+"""Closed loops are simulated by description: what to simulate is small, plain data.
 
 So it can be sent to another process: see :mod:`hjepa_cli.core.evaluation.workers`.
 """
@@ -7,13 +7,12 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol
 
 import numpy as np
 
-from hjepa_cli.config.settings import ProtocolSettings, Settings
+from hjepa_cli.config.schema import ProtocolSettings, Settings
+from hjepa_cli.core.control.drivers import Driver, build_driver
 from hjepa_cli.core.control.loop import Draws, Outcome, simulate
-from hjepa_cli.core.control.methods import Method, build_method
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.conditions import actual_plant
@@ -30,20 +29,12 @@ Pending = Callable[[], Outcome]
 
 
 def silent(steps: int) -> None:
-    """A tick that nobody watches."""
-
-
-class Unit(Protocol):
-    """What is to be computed, as plain data."""
-
-    def compute(self, simulator: "Simulator", tick: Tick) -> Any:
-        """Compute it in the process that has the simulator."""
-        ...
+    """Tell nobody."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """Some devices of one method at some curve points.
+    """Describes some devices of one method at some curve points.
 
     Attributes:
         method: its name.
@@ -60,7 +51,21 @@ class Block:
 
     def compute(self, simulator: "Simulator", tick: Tick) -> Outcome:
         """Simulate the block: outcome arrays [points, stop - start]."""
-        return simulator.simulate(self, tick)
+        driver, draws = simulator.driver(self.method), simulator.draws
+        devices = slice(self.start, self.stop)
+        # Phases of the gap schedule go by a device's number, so schedules are made for all.
+        schedules = np.stack([point.schedule(draws)[:, devices] for point in self.points])
+        loops = schedules[:, 0].size
+        build = driver.reactive if self.reactive else driver.controller
+        return simulate(
+            simulator.plant,
+            draws.part(devices),
+            schedules,
+            build(loops),
+            driver.sensor,
+            delay_steps=driver.delay_steps,
+            tick=lambda: tick(loops),
+        )
 
 
 Runner = Callable[[Sequence[Block], Tick], Callable[[], list[Outcome]]]
@@ -69,7 +74,7 @@ outcomes in the order of the blocks."""
 
 
 class Simulator:
-    """Simulates blocks one after the other, in this process: a :data:`Runner`.
+    """Holds what the units of one model share, and runs blocks in this process: a :data:`Runner`.
 
     Args:
         settings: plant, protocol and seed, from which the draws follow.
@@ -77,63 +82,32 @@ class Simulator:
     """
 
     def __init__(self, settings: Settings, model: Model | None) -> None:
-        protocol = settings.protocol
-        devices = max(protocol.curve_devices, protocol.bracket_devices)
         self.settings, self._model = settings, model
-        self._plant = actual_plant(settings)
-        self._draws = _draws(protocol, devices, settings.seed)
-        self._methods: dict[str, Method] = {}
+        self.plant = actual_plant(settings)
+        self._drivers: dict[str, Driver] = {}
 
     def __call__(self, blocks: Iterable[Block], tick: Tick) -> Callable[[], list[Outcome]]:
-        outcomes = [self.simulate(block, tick) for block in blocks]
+        outcomes = [block.compute(self, tick) for block in blocks]
         return lambda: outcomes
 
-    def run(self, unit: Unit, tick: Tick) -> Any:
-        """Compute a unit."""
-        return unit.compute(self, tick)
+    @property
+    def draws(self) -> Draws:
+        """Return the draws of all of the protocol's devices."""
+        protocol = self.settings.protocol
+        devices = max(protocol.curve_devices, protocol.bracket_devices)
+        return _draws(protocol, devices, self.settings.seed)
 
-    def method(self, name: str) -> Method:
-        """A method, built and fitted when it is asked for first."""
-        if name not in self._methods:
-            self._methods[name] = build_method(name, self.settings, self._model)
-        return self._methods[name]
-
-    def simulate(self, block: Block, tick: Tick) -> Outcome:
-        """Simulate one block: outcome arrays [points, stop - start]."""
-        method = self.method(block.method)
-        devices = slice(block.start, block.stop)
-        # Phases of the gap schedule go by a device's number, so schedules are made for all.
-        schedules = np.stack([point.schedule(self._draws)[:, devices] for point in block.points])
-        loops = schedules[:, 0].size
-        build = method.reactive if block.reactive else method.controller
-        return simulate(
-            self._plant,
-            self._draws.part(devices),
-            schedules,
-            build(loops),
-            method.sensor,
-            delay_steps=method.delay_steps,
-            tick=lambda: tick(loops),
-        )
+    def driver(self, name: str) -> Driver:
+        """Return a method's driver, built and fitted when it is asked for first."""
+        if name not in self._drivers:
+            self._drivers[name] = build_driver(name, self.settings, self._model)
+        return self._drivers[name]
 
 
 @functools.lru_cache(maxsize=1)
 def _draws(protocol: ProtocolSettings, devices: int, seed: int) -> Draws:
-    """The draws that the simulators of several models share."""
+    """Draw once for the simulators of several models."""
     return Draws.make(protocol, devices, seed)
-
-
-def run_points(
-    runner: Runner,
-    method: str,
-    points: Sequence[Point],
-    devices: int,
-    tick: Tick,
-    *,
-    reactive: bool = False,
-) -> Outcome:
-    """Simulate the first ``devices`` devices at some points: outcome arrays [P, devices]."""
-    return start_points(runner, method, points, devices, tick, reactive=reactive)()
 
 
 def start_points(
@@ -145,11 +119,11 @@ def start_points(
     *,
     reactive: bool = False,
 ) -> Pending:
-    """Start :func:`run_points`; what is returned waits for its result, and may be asked twice.
+    """Start to simulate the first ``devices`` devices at some points; return what waits for it.
 
-    A batch is cut by devices, never by points: so its blocks cost the same, whatever each point
-    costs. The cut follows from the batch alone, so that results do not depend on how many
-    processes there are.
+    That may be asked twice, and returns outcome arrays [P, devices]. A batch is cut by devices,
+    never by points: so its blocks cost the same, whatever each point costs. The cut follows from
+    the batch alone, so that results do not depend on how many processes there are.
     """
     count = min(max(len(points) * devices // BLOCK_LOOPS, 1), devices)
     cuts = [devices * number // count for number in range(count + 1)]

@@ -1,4 +1,4 @@
-"""The closed loop on all cores: worker processes, each computing units that were described to it.
+"""Worker processes run closed loops on all cores, each by units that were described to it.
 
 A control step is many small operations on few devices, which threads do not speed up; processes do.
 A unit is computed in one thread, whose sums have one order, wherever that is: so results are the
@@ -12,13 +12,14 @@ import multiprocessing
 import threading
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import torch
 
+from hjepa_cli import plugins
 from hjepa_cli.compute.executors import (
     MAX_WORKERS,
     broken_pool_reported,
@@ -26,9 +27,10 @@ from hjepa_cli.compute.executors import (
     open_cluster,
     placement,
     prepare_worker,
+    spawning,
     worker_pool,
 )
-from hjepa_cli.config.settings import Settings
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.loop import Outcome
 from hjepa_cli.core.evaluation.simulator import Block, Runner, Simulator, Tick, silent
 from hjepa_cli.core.networks.model import Model
@@ -44,10 +46,9 @@ R = TypeVar("R")
 
 @dataclasses.dataclass(frozen=True)
 class ModelFile:
-    """A checkpoint that workers load: where it is, and its digest when the command read it.
+    """Says which checkpoint workers load: where it is, and its digest when the command read it.
 
-    Attributes:
-        loaded: the model, in the process that has loaded it; it is not sent.
+    ``loaded`` is the model, in the process that has loaded it; it is not sent.
     """
 
     path: Path
@@ -58,7 +59,7 @@ class ModelFile:
         return ModelFile, (self.path, self.digest)
 
     def load(self, device: str) -> Model:
-        """Raise DataError if the file has changed since."""
+        """Return the model. Raise DataError if the file has changed since."""
         if self.loaded is not None:
             return self.loaded
         model = Model.load(self.path, device)
@@ -70,16 +71,16 @@ class ModelFile:
         return model
 
 
-class Simulates(Protocol):
-    """What computes units of one kind; made where they are computed."""
+class Unit(Protocol):
+    """Describes work to be done, as plain data."""
 
-    def run(self, unit: Any, tick: Tick) -> Any:
-        """Compute a unit."""
+    def compute(self, simulator: Any, tick: Tick, /) -> Any:
+        """Compute it where the simulator is made."""
         ...
 
 
-Make = Callable[[Settings, Model | None], Simulates]
-"""Makes it: a class of a module, which other processes find by its name."""
+Make = Callable[[Settings, Model | None], Any]
+"""Makes a simulator: a class of a module, which other processes find by its name."""
 
 
 class Workers:
@@ -97,7 +98,7 @@ class Workers:
         self, executor: Executor, count: int, counter: Callable[[], int] | None = None
     ) -> None:
         self.count = count
-        self._finished = self._told = 0
+        self._finished = self._reported = 0
         self._executor, self._counter = executor, counter or (lambda: self._finished)
         self._lock, self._closed = threading.Lock(), False
 
@@ -106,7 +107,7 @@ class Workers:
         make: Make,
         settings: Settings,
         model: ModelFile | None,
-        unit: Hashable,
+        unit: Unit,
         tick: Tick = silent,
     ) -> "Future[Any]":
         """Start a unit; :meth:`results` waits for it.
@@ -135,13 +136,13 @@ class Workers:
                 if self._closed:
                     raise CancelledError
                 now = self._counter()
-                tick(now - self._told)
-                self._told = now
+                tick(now - self._reported)
+                self._reported = now
         with broken_pool_reported():
             return [future.result()[0] for future in futures]
 
     def runner(self, settings: Settings, model: ModelFile | None) -> Runner:
-        """A runner of blocks over the workers."""
+        """Return a runner of blocks over the workers."""
 
         def start(blocks: Sequence[Block], tick: Tick) -> Callable[[], list[Outcome]]:
             futures = [self.submit(Simulator, settings, model, block, tick) for block in blocks]
@@ -153,11 +154,8 @@ class Workers:
         """Drive as many jobs at a time as there are workers, each in a thread of its own.
 
         A job is a search that asks for units step by step: while one waits, the units of another
-        are computed.
-
-        Returns:
-            The jobs and their results, as they are ready. The first error ends it; of what is
-            ready by then nothing is lost.
+        are computed. Yields jobs and their results as they are ready. The first error ends it; of
+        what is ready by then nothing is lost.
         """
         left, flying = iter(jobs), dict[Future[R], J]()
         while True:
@@ -181,30 +179,33 @@ class Workers:
 
 
 class ThisProcess(Workers):
-    """No workers: units are computed as they are submitted, as a worker would."""
+    """Computes units as they are submitted, as a worker would."""
 
     def __init__(self) -> None:
         self.count = 0
-        self._made: dict[Hashable, Simulates] = {}
+        self._made: dict[Hashable, Any] = {}
 
     def submit(
         self,
         make: Make,
         settings: Settings,
         model: ModelFile | None,
-        unit: Hashable,
+        unit: Unit,
         tick: Tick = silent,
     ) -> "Future[Any]":
         """Compute a unit; errors inside it are raised as they are."""
-        future, key = Future[Any](), (make, settings, model)
-        with one_thread():
+        future, key, threads = Future[Any](), (make, settings, model), torch.get_num_threads()
+        torch.set_num_threads(1)  # as in workers, so that sums have one order
+        try:
             if key not in self._made:
                 self._made[key] = make(settings, _loaded(settings, model))
-            future.set_result(self._made[key].run(unit, tick))
+            future.set_result(unit.compute(self._made[key], tick))
+        finally:
+            torch.set_num_threads(threads)
         return future
 
     def results(self, futures: Sequence["Future[Any]"], tick: Tick = silent) -> list[Any]:
-        """The results of units; the ticks were told while they were computed."""
+        """Return the results of units; the ticks were told while they were computed."""
         return [future.result() for future in futures]
 
     def each(self, drive: Callable[[J], R], jobs: Iterable[J]) -> Iterator[tuple[J, R]]:
@@ -214,7 +215,7 @@ class ThisProcess(Workers):
 
 @contextmanager
 def open_workers(unit_steps: int) -> Iterator[Workers]:
-    """The workers of the :func:`~hjepa_cli.compute.executors.placement`.
+    """Yield the workers of the :func:`~hjepa_cli.compute.executors.placement`.
 
     Args:
         unit_steps: device-steps of a usual unit: where the user did not say, there is a process
@@ -230,37 +231,22 @@ def open_workers(unit_steps: int) -> Iterator[Workers]:
         count = 0
     if where.cluster is not None:
         with open_cluster(where.cluster, count or cores()) as (executor, threads):
-            yield from _closing(Workers(executor, threads))
+            with closing(Workers(executor, threads)) as workers:
+                yield workers
     elif count:
-        done: Synchronized[int] = multiprocessing.get_context("spawn").Value("q", 0)
+        with spawning():  # its lock starts a process that keeps track of it
+            done: Synchronized[int] = multiprocessing.get_context("spawn").Value("q", 0)
         counter = done.get_obj()
         with worker_pool(count, _start, done) as pool:
             # Read without the lock: a worker that is killed holding it would never give it back.
-            yield from _closing(Workers(pool, count, lambda: counter.value))
+            with closing(Workers(pool, count, lambda: counter.value)) as workers:
+                yield workers
     else:
         yield ThisProcess()
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Compute as workers do, whose sums have one order."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _closing(workers: Workers) -> Iterator[Workers]:
-    try:
-        yield workers
-    finally:
-        workers.close()
-
-
 def _in_thread(drive: Callable[[J], R], job: J) -> "Future[R]":
-    """A thread that does not keep the program from ending."""
+    """Start a thread that does not keep the program from ending."""
     future: Future[R] = Future()
 
     def run() -> None:
@@ -284,14 +270,8 @@ def _start(done: "Synchronized[int]") -> None:
     _done = done
 
 
-def compute(
-    make: Make, settings: Settings, model: ModelFile | None, unit: Hashable
-) -> tuple[Any, int]:
-    """Compute one unit in a worker, in one thread; the model is loaded with its first.
-
-    Returns:
-        What it is, and how many device-steps it took.
-    """
+def compute(make: Make, settings: Settings, model: ModelFile | None, unit: Unit) -> tuple[Any, int]:
+    """Compute one unit in a worker, in one thread; return it and its device-steps."""
     steps = 0
 
     def tick(count: int) -> None:
@@ -303,12 +283,15 @@ def compute(
 
     with _one_at_a_time:
         torch.set_num_threads(1)
-        return _made(make, settings, model).run(unit, tick), steps
+        return unit.compute(_made(make, settings, model, plugins.in_force()), tick), steps
 
 
 @functools.lru_cache(maxsize=SIMULATORS)
-def _made(make: Make, settings: Settings, model: ModelFile | None) -> Simulates:
-    # The workers of a cluster outlive commands: the digest tells a model from one trained since.
+def _made(
+    make: Make, settings: Settings, model: ModelFile | None, loaded: tuple[plugins.Source, ...]
+) -> Any:
+    # The workers of a cluster outlive commands: digests tell a model from one trained since, and a
+    # plugin from what it was before.
     return make(settings, _loaded(settings, model))
 
 

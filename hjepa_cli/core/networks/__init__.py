@@ -1,1 +1,1 @@
-"""The networks that read frames, predict and act, and a model that holds them."""
+"""Networks read frames, predict and act; a model holds them."""

@@ -1,4 +1,4 @@
-"""The semantic actor: embedding → forces, trained on the teacher's labels (paper §III-A)."""
+"""The semantic actor turns embeddings into forces, as the teacher's labels say (paper §III-A)."""
 
 import math
 from collections.abc import Sequence
@@ -6,19 +6,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from hjepa_cli.core.networks.symmetry import (
-    MirrorLinear,
-    Signs,
-    Twins,
-    embedding_signs,
-    force_signs,
-)
+from hjepa_cli.core.networks.symmetry import embedding_signs, force_signs, linear_layers
 
 SECOND_HIDDEN = 256
 
 
 class Actor(nn.Module):
-    """MLP D-1024-256-1 with ReLU and dropout; ``forward`` is force ÷ force limit, unclipped.
+    """This MLP D-1024-256-1 has ReLU and dropout; ``forward`` is force ÷ force limit, unclipped.
 
     With ``action_shape`` ``(m,)`` its last layer has m outputs. With ``mirror``, what a mirror does
     to each of them, reflected embeddings give mirrored forces, and an upright pole gets none.
@@ -34,29 +28,20 @@ class Actor(nn.Module):
     ) -> None:
         super().__init__()
         self.action_shape = action_shape
-        linear: list[nn.Module] = [
-            nn.Linear(embedding, hidden),
-            nn.Linear(hidden, SECOND_HIDDEN),
-            nn.Linear(SECOND_HIDDEN, math.prod(action_shape)),
-        ]
-        if mirror is not None:
-            first, second = Twins(hidden), Twins(SECOND_HIDDEN)
-            linear = [
-                MirrorLinear(Signs(embedding_signs(embedding)), first),
-                MirrorLinear(first, second),
-                MirrorLinear(second, Signs(force_signs(mirror))),
-            ]
+        forces = force_signs(mirror or (1.0,) * math.prod(action_shape))
+        parts = embedding_signs(embedding), hidden, SECOND_HIDDEN, forces
+        first, second, last = linear_layers(*parts, mirrored=mirror is not None)
         self.layers = nn.Sequential(
-            *(linear[0], nn.ReLU(), nn.Dropout(dropout)),
-            *(linear[1], nn.ReLU(), nn.Dropout(dropout)),
-            linear[2],
+            *(first, nn.ReLU(), nn.Dropout(dropout)),
+            *(second, nn.ReLU(), nn.Dropout(dropout)),
+            last,
         )
 
     def forward(self, z: Tensor) -> Tensor:
-        """Embeddings [..., D] → actions [..., *A] in units of the force limit."""
+        """Map embeddings [..., D] to actions [..., *A] in units of the force limit."""
         action: Tensor = self.layers(z).reshape(*z.shape[:-1], *self.action_shape)
         return action
 
     def act(self, z: Tensor) -> Tensor:
-        """The action that can be applied: ``forward`` clipped to ±1."""
+        """Return the action that can be applied: ``forward`` clipped to ±1."""
         return torch.clamp(self(z), -1.0, 1.0)

@@ -1,17 +1,15 @@
-"""The decoder of the auto-encoder: an embedding in, the encoder's input out."""
+"""The decoder of the auto-encoder turns an embedding into what the encoder saw."""
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from hjepa_cli.core.networks.encoder import MAP_PX, STEM_PX
+from hjepa_cli.core.networks.encoder import MAP_PX, STEM_PX, Encoder
 from hjepa_cli.core.networks.symmetry import (
     MirrorConv2d,
-    MirrorLinear,
     MirrorNorm2d,
-    Signs,
-    Twins,
     embedding_signs,
+    linear_layers,
     unflatten_twins,
 )
 from hjepa_cli.core.plants.frames import CHANNELS, HEIGHT_PX, WIDTH_PX
@@ -21,15 +19,11 @@ STEPS = len(MAPS) - 1
 
 
 class Decoder(nn.Module):
-    """Embeddings [N, D] → what the encoder saw of the frames, standardised [N, 3κ, 64, 128].
+    """It paints, from embeddings [N, D], what the encoder saw, standardised [N, 3κ, 64, 128].
 
-    The encoder backwards: a linear layer makes a 2 × 4 map, which is enlarged by copying pixels
-    between 3 × 3 convolutions with batch norm; at last every value of the map becomes a square.
-
-    Args:
-        embedding: D.
-        frames: κ.
-        symmetric: reflected embeddings give mirrored pictures.
+    It is the encoder backwards: a linear layer makes a 2 × 4 map, which is enlarged by copying
+    pixels between 3 × 3 convolutions with batch norm; at last every value becomes a square.
+    ``symmetric`` ones answer reflected embeddings by mirrored pictures.
     """
 
     input_mean: Tensor
@@ -38,15 +32,11 @@ class Decoder(nn.Module):
     def __init__(self, embedding: int, frames: int = 2, symmetric: bool = False) -> None:
         super().__init__()
         self.symmetric = symmetric
-        height, width = HEIGHT_PX // MAP_PX, WIDTH_PX // MAP_PX
-        self.map = (MAPS[0], height, width)
-        self.expand: nn.Module = nn.Linear(embedding, MAPS[0] * height * width)
-        convolution: type[nn.Conv2d] = nn.Conv2d
-        norm: type[nn.BatchNorm2d] = nn.BatchNorm2d
-        if symmetric:
-            units = Twins(MAPS[0] * height * width)
-            self.expand = MirrorLinear(Signs(embedding_signs(embedding)), units)
-            convolution, norm = MirrorConv2d, MirrorNorm2d
+        self.map = (MAPS[0], HEIGHT_PX // MAP_PX, WIDTH_PX // MAP_PX)
+        units = MAPS[0] * self.map[1] * self.map[2]
+        (self.expand,) = linear_layers(embedding_signs(embedding), units, mirrored=symmetric)
+        convolution = MirrorConv2d if symmetric else nn.Conv2d
+        norm = MirrorNorm2d if symmetric else nn.BatchNorm2d
         self.convolutions = nn.ModuleList(
             convolution(MAPS[i], MAPS[i + 1], 3, 1, 1, bias=False) for i in range(STEPS)
         )
@@ -58,13 +48,12 @@ class Decoder(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, z: Tensor) -> Tensor:
-        """[N, D] → float32 [N, 3κ, 64, 128]."""
+        """Map embeddings [N, D] to float32 pictures [N, 3κ, 64, 128]."""
         x = F.relu(self.expand(z))
-        channels, height, width = self.map
         if self.symmetric:
-            x = unflatten_twins(x, channels, height, width)
+            x = unflatten_twins(x, *self.map)
         else:
-            x = x.reshape(-1, channels, height, width)
+            x = x.reshape(-1, *self.map)
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             x = F.relu(norm(convolution(F.interpolate(x, scale_factor=2.0))))
         weight = self.paint.weight
@@ -73,10 +62,23 @@ class Decoder(nn.Module):
         return F.conv_transpose2d(x, weight, self.paint.bias, stride=STEM_PX).float()
 
     def standardise(self, inputs: Tensor) -> Tensor:
-        """What :meth:`forward` should have painted: inputs [N, 3κ, 64, 128] in its units."""
+        """Return what :meth:`forward` should have painted of inputs [N, 3κ, 64, 128]."""
         return (inputs.float() - self.input_mean[:, None, None]) / self.input_std[:, None, None]
 
     def restore(self, z: Tensor) -> Tensor:
-        """Embeddings [N, D] → the encoder's inputs [N, 3κ, 64, 128], in grey levels."""
+        """Map embeddings [N, D] to the encoder's inputs [N, 3κ, 64, 128], in grey levels."""
         painted: Tensor = self(z)
         return painted * self.input_std[:, None, None] + self.input_mean[:, None, None]
+
+
+def read_frames(networks: nn.ModuleDict, frames: Tensor) -> Tensor:
+    """Return the embeddings [N, D] that the actor gets of frames uint8 [N, κ, 64, 128, 3].
+
+    With a decoder among the networks they are those of the reconstructed frames.
+    """
+    z: Tensor = networks["encoder"](frames)
+    if "decoder" not in networks:
+        return z
+    decoder, reader = networks["decoder"], networks["reader"]
+    assert isinstance(decoder, Decoder) and isinstance(reader, Encoder)
+    return reader.embed(decoder.restore(z))

@@ -1,4 +1,4 @@
-"""The context encoder Ψ: camera frames in, one embedding out (paper §III-A).
+"""The context encoder Ψ turns camera frames into one embedding (paper §III-A).
 
 A residual network with three stages of 64, 128 and 256 channels keeps a 2 × 4 map to its last
 layer, because a cart-pole is where things are: global average pooling would throw the positions
@@ -19,12 +19,10 @@ from torch.nn.utils import fuse_conv_bn_eval
 from hjepa_cli.core.networks.symmetry import (
     MirrorCentre,
     MirrorConv2d,
-    MirrorLinear,
     MirrorNorm2d,
-    Signs,
-    Twins,
     embedding_signs,
     flatten_twins,
+    linear_layers,
 )
 from hjepa_cli.core.plants.frames import CHANNELS, HEIGHT_PX, WIDTH_PX
 
@@ -43,7 +41,7 @@ def normalise(z: Tensor) -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions with batch norm around a (projected) identity.
+    """It adds two convolutions with batch norm to a projected identity.
 
     A stride is taken by a kernel as wide as itself and by averaging on the way around: such grids
     have mirror images (:mod:`hjepa_cli.core.networks.symmetry`).
@@ -53,43 +51,38 @@ class ResidualBlock(nn.Module):
         self, channels_in: int, channels_out: int, stride: int, *, symmetric: bool = False
     ) -> None:
         super().__init__()
+        conv = MirrorConv2d if symmetric else nn.Conv2d
+        norm = MirrorNorm2d if symmetric else nn.BatchNorm2d
         kernel, padding = (3, 1) if stride == 1 else (stride, 0)
-        self.conv1 = _conv(channels_in, channels_out, kernel, stride, padding, symmetric)
-        self.norm1 = _norm(channels_out, symmetric)
-        self.conv2 = _conv(channels_out, channels_out, 3, 1, 1, symmetric)
-        self.norm2 = _norm(channels_out, symmetric)
+        self.conv1 = conv(channels_in, channels_out, kernel, stride, padding, bias=False)
+        self.norm1 = norm(channels_out)
+        self.conv2 = conv(channels_out, channels_out, 3, 1, 1, bias=False)
+        self.norm2 = norm(channels_out)
         self.shrink = nn.AvgPool2d(stride) if stride > 1 else nn.Identity()
-        self.project = _conv(channels_in, channels_out, 1, 1, 0, symmetric)
-        self.project_norm = _norm(channels_out, symmetric)
+        self.project = conv(channels_in, channels_out, 1, bias=False)
+        self.project_norm = norm(channels_out)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, channels_in, H, W] → [N, channels_out, H / stride, W / stride]."""
+        """Map [N, channels_in, H, W] to [N, channels_out, H / stride, W / stride]."""
         y = F.relu(self.norm1(self.conv1(x)))
         return F.relu(self.norm2(self.conv2(y)) + self.project_norm(self.project(self.shrink(x))))
 
-    def fold(self) -> None:
-        """Move the batch norms into the convolutions, for good."""
-        _fold(self, "conv1", "norm1")
-        _fold(self, "conv2", "norm2")
-        _fold(self, "project", "project_norm")
-
 
 class Encoder(nn.Module):
-    """Ψ_θ: uint8 frames [N, κ, 64, 128, 3] → embeddings [N, D] of length √D.
+    """Ψ_θ maps uint8 frames [N, κ, 64, 128, 3] to embeddings [N, D] of length √D.
 
     Args:
         embedding: D, 256 in the paper.
         frame_input: ``"difference"`` feeds [current, current − previous], each standardised by
             its own training statistics, which makes the sub-pixel velocity signal visible;
             ``"pair"`` feeds [current, previous] (the paper).
-        centre: batch-normalise z (no affine) before its length is fixed, then add a constant to
-            every value. Centred embeddings alone have no direction at the mean state, the upright
-            pole of all states; with an offset as long as themselves, fixing their length bends
-            them little there and the states stay linearly readable (docs/LOG.md).
-        symmetric: built so that the embedding of a mirrored picture is the reflected embedding
-            (:mod:`hjepa_cli.core.networks.symmetry`); D is even then, and the offset is on the even half.
-        frames: κ. Before the current one lie κ − 1 earlier ones: themselves, or the difference of
-            each frame to the one before it.
+        centre: whether z is batch-normalised (no affine) before its length is fixed, and then a
+            constant added to every value. Centred embeddings alone have no direction at the mean
+            state, the upright pole of all states; with an offset as long as themselves, fixing
+            their length bends them little there and states stay linearly readable (docs/LOG.md).
+        symmetric: whether the embedding of a mirrored picture is the reflected embedding; D is
+            even then, and the offset is on the even half.
+        frames: κ, the current one and κ − 1 earlier ones.
     """
 
     input_mean: Tensor
@@ -111,45 +104,40 @@ class Encoder(nn.Module):
         self.register_buffer("input_std", torch.ones(channels))
         halves = 2 if symmetric else 1
         self.stem = nn.Conv2d(channels, STEM_CHANNELS // halves, STEM_PX, STEM_PX, bias=False)
-        self.stem_norm = _norm(STEM_CHANNELS, symmetric)
+        self.stem_norm = (MirrorNorm2d if symmetric else nn.BatchNorm2d)(STEM_CHANNELS)
         self.stages = nn.Sequential(
             ResidualBlock(STEM_CHANNELS, 64, 2, symmetric=symmetric),
             ResidualBlock(64, 128, 2, symmetric=symmetric),
             ResidualBlock(128, 256, 2, symmetric=symmetric),
         )
         features = MAP_CHANNELS * (HEIGHT_PX // MAP_PX) * (WIDTH_PX // MAP_PX)
-        self.squeeze = _conv(256, MAP_CHANNELS, 1, 1, 0, symmetric, bias=True)
-        self.head: nn.Module = nn.Linear(features, embedding)
-        self.centre: nn.Module | None = nn.BatchNorm1d(embedding, affine=False)
+        self.squeeze = (MirrorConv2d if symmetric else nn.Conv2d)(256, MAP_CHANNELS, 1, bias=True)
+        (self.head,) = linear_layers(features, embedding_signs(embedding), mirrored=symmetric)
+        self.centre: nn.Module | None = None
+        if centre:
+            self.centre = (
+                MirrorCentre(embedding) if symmetric else nn.BatchNorm1d(embedding, affine=False)
+            )
         offset = torch.ones(embedding)
         if symmetric:
-            signs = embedding_signs(embedding)
-            self.head = MirrorLinear(Twins(features), Signs(signs))
-            self.centre = MirrorCentre(embedding)
             offset[: embedding // 2] *= 2**0.5  # a reflection must not change it
             offset[embedding // 2 :] = 0.0
-        if not centre:
-            self.centre = None
         self.register_buffer("offset", offset, persistent=False)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def fit_standardisation(self, frames: Tensor) -> None:
-        """Measure per-channel mean and standard deviation of all inputs.
-
-        Args:
-            frames: uint8 [N, κ, 64, 128, 3].
-        """
+        """Measure mean and deviation of every channel on uint8 frames [N, κ, 64, 128, 3]."""
         inputs = self.inputs(frames)
         flat = inputs.permute(0, 2, 3, 1).reshape(-1, inputs.shape[1]).float()
         self.input_mean.copy_(flat.mean(0))
         self.input_std.copy_(flat.std(0).clamp_min(1e-3))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """uint8 frames [N, κ, 64, 128, 3] → float32 embeddings [N, D]."""
+        """Map uint8 frames [N, κ, 64, 128, 3] to float32 embeddings [N, D]."""
         return self.embed(self.inputs(frames))
 
     def embed(self, x: Tensor) -> Tensor:
-        """Inputs [N, 3κ, 64, 128] as of :meth:`inputs` → float32 embeddings [N, D]."""
+        """Map what :meth:`inputs` returns, [N, 3κ, 64, 128], to float32 embeddings [N, D]."""
         if not torch.is_autocast_enabled(x.device.type):
             x = x.float()
         x = F.relu(self.stem_norm(F.conv2d(x, *self._stem(), stride=STEM_PX)))
@@ -159,7 +147,7 @@ class Encoder(nn.Module):
 
     @torch.no_grad()
     def folded(self) -> Self:
-        """A copy for inference, with all batch norms inside the convolutions: same z, sooner."""
+        """Return a copy for inference, all batch norms inside the convolutions: same z, sooner."""
         frozen = copy.deepcopy(self).eval()
         weight, offset = frozen._stem()
         frozen.stem = nn.Conv2d(weight.shape[1], STEM_CHANNELS, STEM_PX, STEM_PX).eval()
@@ -168,13 +156,14 @@ class Encoder(nn.Module):
         frozen.input_mean.zero_()
         frozen.input_std.fill_(1.0)
         for block in frozen.stages:
-            block.fold()  # type: ignore[operator]
+            for pair in (("conv1", "norm1"), ("conv2", "norm2"), ("project", "project_norm")):
+                _fold(block, *pair)
         return frozen
 
     def _stem(self) -> tuple[Tensor, Tensor]:
-        """The stem's weights and offset with the standardisation inside.
+        """Return the stem's weights and offset with the standardisation inside.
 
-        The same sum, (w/s)·x − Σ(w/s)·m, without three passes over the pixels.
+        The sum is the same, (w/s)·x − Σ(w/s)·m, without three passes over the pixels.
         """
         weight = self.stem.weight / self.input_std[:, None, None]
         offset = -(weight * self.input_mean[:, None, None]).sum((1, 2, 3))
@@ -185,9 +174,9 @@ class Encoder(nn.Module):
         return weight, offset
 
     def inputs(self, frames: Tensor) -> Tensor:
-        """What the network sees of frames [N, κ, 64, 128, 3]: [N, 3κ, 64, 128], the present first.
+        """Return what the network sees of frames [N, κ, 64, 128, 3], the present first.
 
-        In bfloat16: pixels and their differences are exact in it.
+        It is [N, 3κ, 64, 128] in bfloat16: pixels and their differences are exact in it.
         """
         seen = [frame.bfloat16() for frame in reversed(frames.unbind(1))]
         earlier = seen[1:]
@@ -197,30 +186,12 @@ class Encoder(nn.Module):
         return torch.cat([seen[0], *earlier], dim=-1).permute(0, 3, 1, 2)
 
 
-def _conv(
-    channels_in: int,
-    channels_out: int,
-    kernel: int,
-    stride: int,
-    padding: int,
-    symmetric: bool,
-    *,
-    bias: bool = False,
-) -> nn.Conv2d:
-    kind = MirrorConv2d if symmetric else nn.Conv2d
-    return kind(channels_in, channels_out, kernel, stride, padding, bias=bias)
-
-
-def _norm(channels: int, symmetric: bool) -> nn.BatchNorm2d:
-    return MirrorNorm2d(channels) if symmetric else nn.BatchNorm2d(channels)
-
-
 def _fold(module: nn.Module, convolution: str, norm: str) -> None:
     """Move one batch norm's running statistics and affine part into its convolution, for good."""
     conv, batch_norm = getattr(module, convolution), getattr(module, norm)
     if isinstance(conv, MirrorConv2d):
-        conv = conv.ordinary()
-    if isinstance(batch_norm, MirrorNorm2d):
+        conv, batch_norm = conv.ordinary(), batch_norm.ordinary()
+    elif isinstance(batch_norm, MirrorNorm2d):  # the stem's, whose twins are whole by then
         batch_norm = batch_norm.ordinary()
     setattr(module, convolution, fuse_conv_bn_eval(conv, batch_norm))
     setattr(module, norm, nn.Identity())

@@ -1,7 +1,6 @@
-"""Is the representation alive, and does it know the state? The numbers behind the stage gates.
+"""These numbers tell the stage gates whether embeddings are alive and know the state.
 
-All functions take plain float tensors; nothing here trains the encoder (docs/metrics.md lists the
-healthy ranges).
+Nothing here trains the encoder; docs/metrics.md lists the healthy ranges.
 """
 
 import math
@@ -18,12 +17,10 @@ def probe_r2(
     test_states: Tensor,
     names: Sequence[str],
 ) -> dict[str, float]:
-    """Held-out R² of a linear least-squares probe from embeddings to each state.
+    """Return the held-out R² of a linear least-squares probe from embeddings to each state.
 
-    Args:
-        train_z, test_z: embeddings [N, D] and [N', D].
-        train_states, test_states: [N, S] and [N', S].
-        names: of the S states.
+    It is fitted on embeddings [N, D] and states [N, S] and tested on others; ``names`` are those
+    of the S states.
     """
     truth = test_states.double()
     residual = truth - read_probe(fit_probe(train_z, train_states), test_z)
@@ -32,7 +29,7 @@ def probe_r2(
 
 
 def fit_probe(z: Tensor, states: Tensor) -> Tensor:
-    """Linear least squares from embeddings [N, D] to states [N, S]: weights [D + 1, S], float64."""
+    """Return weights [D + 1, S], float64, of least squares from embeddings [N, D] to [N, S]."""
     design = _with_intercept(z)
     # A tiny ridge keeps collapsed embeddings solvable; 1e-6 of the mean square moves no healthy R².
     gram = design.T @ design
@@ -42,12 +39,12 @@ def fit_probe(z: Tensor, states: Tensor) -> Tensor:
 
 
 def read_probe(weights: Tensor, z: Tensor) -> Tensor:
-    """States [N, S] that a probe reads from embeddings [N, D]."""
+    """Return the states [N, S] that a probe reads from embeddings [N, D]."""
     return _with_intercept(z) @ weights
 
 
 def effective_rank(z: Tensor) -> float:
-    """exp of the entropy of the normalised squared singular values of centred z [N, D]."""
+    """Return exp of the entropy of the squared singular values of centred z [N, D], normalised."""
     energy = torch.linalg.svdvals((z - z.mean(0)).double()).square()
     share = energy / energy.sum().clamp_min(1e-30)
     return float(torch.exp(-(share * torch.log(share.clamp_min(1e-30))).sum()))
@@ -60,9 +57,9 @@ def action_sensitivity(
     steps: int,
     action_shape: tuple[int, ...] = (),
 ) -> float:
-    """mean ‖P(z, +u_max) − P(z, −u_max)‖ ÷ mean ‖z_{k+h} − z_k‖ over embeddings [N, D].
+    """Return mean ‖P(z, +u_max) − P(z, −u_max)‖ ÷ mean ‖z_{k+h} − z_k‖ over embeddings [N, D].
 
-    Where several forces drive a device, the mean over them, one at a time.
+    Where several forces drive a device, it is the mean over them, one at a time.
     """
     spreads = []
     for force in torch.eye(math.prod(action_shape), dtype=z.dtype):
@@ -73,7 +70,7 @@ def action_sensitivity(
 
 
 def nrmse(predicted: Tensor, truth: Tensor) -> float:
-    """Root mean square error ÷ root mean square of the truth, over all of two equal shapes."""
+    """Return the root mean square error ÷ the root mean square of the truth, of equal shapes."""
     return float((predicted - truth).square().mean().sqrt() / truth.square().mean().sqrt())
 
 

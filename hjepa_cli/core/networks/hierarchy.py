@@ -1,6 +1,6 @@
-"""The hierarchy of predictors: how strides nest, in training and in the closed loop.
+"""The hierarchy of predictors nests strides, in training and in the closed loop.
 
-Notation: a packet at step k restarts all grids at k. Coarse anchors lie at a = k, k + h, …; the
+A packet at step k restarts all grids at k. Coarse waypoints lie at a = k, k + h, …; the
 medium level fills a + m, a + 2m, … inside each gap, the low level l, 2l, … inside each m-step.
 Actions are in units of the force limit everywhere in this file; *A is their shape at one step.
 """
@@ -17,16 +17,16 @@ from hjepa_cli.core.networks.predictors import Predictor
 
 
 class Step(Protocol):
-    """What the schemes below ask of a predictor (see :class:`Predictor`)."""
+    """It takes one stride, as :meth:`Predictor.forward` does."""
 
     def __call__(
-        self, z: Tensor, actions: Tensor, anchor: Tensor | None = None, remaining: int = 1
+        self, z: Tensor, actions: Tensor, waypoint: Tensor | None = None, remaining: int = 1
     ) -> Tensor: ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Strides:
-    """Strides of the three levels in control steps.
+    """The three levels take these strides, in control steps.
 
     Raises:
         UsageError: unless h is a multiple of m and m a multiple of l, all positive.
@@ -41,7 +41,7 @@ class Strides:
 
 
 def rollout(predictor: Step, z: Tensor, actions: Tensor) -> Tensor:
-    """Autoregressive prediction: z [N, D], actions [N, S, steps, *A] → [N, S + 1, D], z first."""
+    """Predict autoregressively: z [N, D] and actions [N, S, steps, *A] give [N, S + 1, D]."""
     states = [z]
     for stride in range(actions.shape[1]):
         states.append(predictor(states[-1], actions[:, stride]))
@@ -51,19 +51,14 @@ def rollout(predictor: Step, z: Tensor, actions: Tensor) -> Tensor:
 def fill_gap(predictor: Step, left: Tensor, right: Tensor, actions: Tensor) -> Tensor:
     """Interpolate inside one gap: the finer level walks from ``left`` towards the fixed ``right``.
 
-    Args:
-        predictor: the finer level's step.
-        left, right: embeddings [N, D] at both ends of the gap.
-        actions: [N, C, steps, *A], one row per sub-stride.
-
-    Returns:
-        Embeddings [N, C + 1, D] on the finer grid, both ends included.
+    Embeddings [N, D] at both ends and actions [N, C, steps, *A], one row per sub-stride, give
+    embeddings [N, C + 1, D] on the finer grid, both ends included.
     """
     count = actions.shape[1]
     states = [left]
     for index in range(count - 1):
         states.append(
-            predictor(states[-1], actions[:, index], anchor=right, remaining=count - index)
+            predictor(states[-1], actions[:, index], waypoint=right, remaining=count - index)
         )
     return torch.stack([*states, right], dim=1)
 
@@ -76,72 +71,55 @@ def plan_stride(
     z: Tensor,
     strides: Strides,
     *,
-    recompute_anchor: bool,
+    recompute_waypoint: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Play one coarse stride from its anchor, the controller's only work inside a gap.
+    """Play one coarse stride from its waypoint, the controller's only work inside a gap.
 
-    The next anchor is first predicted with the first action held; the finer levels then fill in
+    The next waypoint is first predicted with the first action held; the finer levels then fill in
     embeddings and the actions that answer them. Where a held action leads far from where these
-    actions lead, the finer levels were misled: so the anchor is predicted again and the stride
+    actions lead, the finer levels were misled: so the waypoint is predicted again and the stride
     played once more. With what was played last, P^H predicts where the next stride starts.
 
     Args:
-        act: embeddings [N, D] → actions [N, *A].
+        act: a function from embeddings [N, D] to actions [N, *A].
         coarse, medium, low: P^H, P^M, P^L.
-        z: anchor embeddings [N, D].
-        strides: (h, m, l).
-        recompute_anchor: ``False`` keeps the first coarse prediction (the paper's literal reading).
+        z: waypoint embeddings [N, D].
+        recompute_waypoint: ``False`` keeps the first coarse prediction, the paper's literal text.
 
     Returns:
         Actions [N, h, *A]; embeddings [N, h / l, D] on the finest grid they were taken at;
-        the next anchor [N, D].
-    """
-    first = act(z)
-    anchor = coarse(z, hold(first, strides.h))
-    actions, embeddings = play_stride(act, medium, low, z, anchor, first, strides)
-    if recompute_anchor:
-        anchor = coarse(z, actions)
-        actions, embeddings = play_stride(act, medium, low, z, anchor, first, strides, actions)
-        anchor = coarse(z, actions)
-    return actions, embeddings, anchor
-
-
-def play_stride(
-    act: Callable[[Tensor], Tensor],
-    medium: Step,
-    low: Step,
-    z: Tensor,
-    anchor: Tensor,
-    first: Tensor,
-    strides: Strides,
-    expected: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Fill the stride between two anchors: embeddings, and the actions that answer them.
-
-    Args:
-        act, medium, low, strides: as for :func:`plan_stride`.
-        z, anchor: embeddings [N, D] at both ends.
-        first: action [N, *A] that answers ``z``.
-        expected: actions [N, h, *A] of the stride, if it was played before: P^M takes its strides
-            to be under these, otherwise under the action at their beginning, held.
-
-    Returns:
-        Actions [N, h, *A]; embeddings [N, h / l, D].
+        the next waypoint [N, D].
     """
     h, m, l = strides.h, strides.m, strides.l
-    actions, embeddings = [], []
-    for begin in range(0, h, m):
-        left, action = (h - begin) // m, act(z) if begin else first
-        under = hold(action, m) if expected is None else expected[:, begin : begin + m]
-        z_next = anchor if left == 1 else medium(z, under, anchor, left)
-        for remaining in range(m // l, 0, -1):
-            embeddings.append(z)
-            actions.append(hold(action, l))
-            if remaining > 1:
-                z = low(z, actions[-1], z_next, remaining)
-                action = act(z)
-        z = z_next
-    return torch.cat(actions, dim=1), torch.stack(embeddings, dim=1)
+    first = act(z)
+
+    def play(waypoint: Tensor, expected: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Fill the stride up to a waypoint; return the actions, and the embeddings they answer.
+
+        P^M takes its strides to be under the actions ``expected``, if the stride was played
+        before, otherwise under the action at their beginning, held.
+        """
+        at, actions, embeddings = z, [], []
+        for begin in range(0, h, m):
+            left, action = (h - begin) // m, act(at) if begin else first
+            under = hold(action, m) if expected is None else expected[:, begin : begin + m]
+            following = waypoint if left == 1 else medium(at, under, waypoint, left)
+            for remaining in range(m // l, 0, -1):
+                embeddings.append(at)
+                actions.append(hold(action, l))
+                if remaining > 1:
+                    at = low(at, actions[-1], following, remaining)
+                    action = act(at)
+            at = following
+        return torch.cat(actions, dim=1), torch.stack(embeddings, dim=1)
+
+    waypoint = coarse(z, hold(first, h))
+    actions, embeddings = play(waypoint)
+    if recompute_waypoint:
+        waypoint = coarse(z, actions)
+        actions, embeddings = play(waypoint, actions)
+        waypoint = coarse(z, actions)
+    return actions, embeddings, waypoint
 
 
 def hold(action: Tensor, steps: int) -> Tensor:
@@ -159,26 +137,21 @@ def build_predictors(
     forces: int = 1,
     mirror: Sequence[float] | None = None,
 ) -> dict[str, Predictor]:
-    """The three levels and the flat baseline ``ts-jepa-1``, keyed as in the checkpoint.
+    """Return the three levels and the flat baseline ``ts-jepa-1``, keyed as in the checkpoint.
 
     ``forces`` drive a device at every step; ``mirror`` as for :class:`Predictor`.
     """
     h, m, l = strides.h, strides.m, strides.l
-
-    def level(steps: int, **anchoring: int) -> Predictor:
-        return Predictor(
+    levels = {"high": (h, 0), "medium": (m, h // m), "low": (l, m // l), "flat": (1, 0)}
+    return {
+        name: Predictor(
             embedding,
             hidden,
             steps * forces if all_actions else forces,
-            anchored=bool(anchoring),
+            guided=distances > 0,
+            distances=distances,
             residual=residual,
             mirror=mirror,
-            **anchoring,
         )
-
-    return {
-        "high": level(h),
-        "medium": level(m, distances=h // m),
-        "low": level(l, distances=m // l),
-        "flat": level(1),
+        for name, (steps, distances) in levels.items()
     }

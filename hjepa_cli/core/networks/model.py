@@ -1,4 +1,4 @@
-"""A trained model: all networks that drive devices in one object, as a checkpoint holds them."""
+"""A trained model holds all networks that drive devices, as a checkpoint has them."""
 
 import copy
 import functools
@@ -14,22 +14,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hjepa_cli.compute.device import autocast, compute_dtype, resolve_device
-from hjepa_cli.config.checks import ANCHORS, REFLEXES
+from hjepa_cli.core.arrays import finite
 from hjepa_cli.core.networks.actor import Actor
-from hjepa_cli.core.networks.decoder import Decoder
+from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
-from hjepa_cli.core.networks.hierarchy import Strides, build_predictors, hold, plan_stride
-from hjepa_cli.core.networks.planning import Planner, Reaction
-from hjepa_cli.core.networks.read_frames import read_frames
+from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
 
 ENCODE_BATCH = 64  # larger ones fall out of the caches
+KINDS = ("encoder", "hierarchy", "flat", "supervised", "autoencoder", "reflex")
 CHOICES = {  # of an architecture; its other values are sizes
-    "kind": ("encoder", "hierarchy", "flat", "supervised", "autoencoder", "reflex"),
     "frame_input": ("difference", "pair"),
     "frames": (2, 4),
     "stride_actions": ("all", "held"),
@@ -59,21 +58,43 @@ def build_modules(
     - ``flat``: Ψ, a predictor of stride h, the one of stride 1 and the actor;
     - ``supervised``: Ψ, of κ frames, and the actor;
     - ``autoencoder``: Ψ, the decoder, a second Ψ that reads what was decoded, and the actor;
-    - ``reflex``: Ψ, the actor, one of a law that fades, and the reflexes without and with forces.
+    - ``reflex``: Ψ, the actor, one of a law that fades, and the reflexes without and with forces;
+    - any other: what the method of a plugin that has this kind builds.
+
+    Raises:
+        UsageError: no method in force has this kind.
     """
-    kind, embedding = architecture["kind"], architecture["embedding"]
+    kind = architecture["kind"]
+    if kind not in KINDS:
+        built: nn.ModuleDict = _extended(kind).modules(architecture, action_shape, force_signs)
+        return built
+    embedding, frames = architecture["embedding"], architecture.get("frames", 2)
     symmetric = architecture["mirror"] == "exact"
     mirror = force_signs if symmetric else None
-    frames = architecture.get("frames", 2)
 
     def encoder() -> Encoder:
         frame_input, centre = architecture["frame_input"], architecture["centre"]
         return Encoder(embedding, frame_input, centre, symmetric, frames)
 
+    def actor() -> Actor:
+        hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
+        return Actor(embedding, hidden, dropout, action_shape, mirror)
+
+    def reflex(forces_at_once: int, *, sees_forces: bool) -> Reflex:
+        return Reflex(
+            embedding,
+            architecture["actor_hidden"],
+            longest_age=architecture["longest_age"],
+            forces_at_once=forces_at_once,
+            sees_forces=sees_forces,
+            action_shape=action_shape,
+            mirror=mirror,
+        )
+
     modules = nn.ModuleDict({"encoder": encoder()})
     if kind in LEVELS:
         predictors = build_predictors(
-            Strides(architecture["h"], architecture["m"], architecture["l"]),
+            Strides(*(architecture[name] for name in "hml")),
             embedding,
             architecture["hidden"],
             all_actions=architecture["stride_actions"] == "all",
@@ -86,45 +107,31 @@ def build_modules(
         modules["decoder"] = Decoder(embedding, frames, symmetric)
         modules["reader"] = encoder()
     if kind != "encoder":
-        hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
-        modules["actor"] = Actor(embedding, hidden, dropout, action_shape, mirror)
+        modules["actor"] = actor()
     if kind == "reflex":
-        modules["law"] = Actor(embedding, hidden, dropout, action_shape, mirror)
-        for name, forces_at_once in (
-            ("chunk", architecture["forces_at_once"]),
-            # What follows a force that is not the teacher's depends on the next one: one at a time.
-            ("chunk_forces", 1),
-        ):
-            modules[name] = Reflex(
-                embedding,
-                hidden,
-                longest_age=architecture["longest_age"],
-                forces_at_once=forces_at_once,
-                sees_forces=name == "chunk_forces",
-                action_shape=action_shape,
-                mirror=mirror,
-            )
+        modules["law"] = actor()
+        modules["chunk"] = reflex(architecture["forces_at_once"], sees_forces=False)
+        # What follows a force that is not the teacher's depends on the next one: one at a time.
+        modules["chunk_forces"] = reflex(1, sees_forces=True)
     return modules
 
 
+def _extended(kind: str) -> Any:
+    """Return the method of a plugin that builds networks of this kind.
+
+    Raises:
+        UsageError: there is none.
+    """
+    for method in METHODS.values():
+        if getattr(method, "kind", None) == kind:
+            return method
+    raise UsageError(f"no method builds networks of kind '{kind}'")
+
+
 def levels_of(architecture: Mapping[str, Any]) -> tuple[str, ...]:
-    """The predictors of an architecture; a flat one of stride 1 has one for both its levels."""
+    """Name an architecture's predictors; a flat one of stride 1 has one for both its levels."""
     levels = LEVELS[architecture["kind"]]
     return levels[1:] if (architecture["kind"], architecture["h"]) == ("flat", 1) else levels
-
-
-def offered(architecture: Mapping[str, Any], states: int = 4) -> tuple[str, ...]:
-    """The methods that a model of this architecture can drive a plant of S states with."""
-    kind, h = architecture["kind"], architecture.get("h")
-    if kind == "encoder":
-        return ()
-    if kind == "reflex":
-        return REFLEXES
-    if kind not in LEVELS:
-        return (f"{kind}-{architecture['frames']}",)
-    planned = dict.fromkeys((f"ts-jepa-{h}", "ts-jepa-1"))  # once where h is 1
-    anchors = [name for name in ANCHORS if name != "state-48" or states == 4]
-    return (*(("hjepa",) if kind == "hierarchy" else ()), *planned, "hold", "zero", *anchors)
 
 
 def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
@@ -136,28 +143,23 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
         DataError: there is no such architecture, the tensors do not fit it, or the camera has
             changed since.
     """
-    metadata = check_metadata(checkpoint)
+    metadata, found = check_metadata(checkpoint), f"checkpoint {checkpoint.path}"
     architecture, kind = metadata["architecture"], plant(metadata["plant"])
     if "camera" in metadata and not same_camera(metadata["camera"], kind):
         raise DataError(
-            f"checkpoint {checkpoint.path} was trained on another camera's pictures than plant "
-            f"{kind.name} has now",
+            f"{found} was trained on another camera's pictures than plant {kind.name} has now",
             hint="train it again",
         )
     largest = max((array.size for array in checkpoint.tensors.values()), default=0)
     for name, value in architecture.items():
         if isinstance(value, int) and value > largest:
-            raise DataError(
-                f"checkpoint {checkpoint.path}: {name} = {value}, but no tensor has so many values"
-            )
+            raise DataError(f"{found}: {name} = {value}, but no tensor has so many values")
     try:
         with torch.device("meta"):
             planned = build_modules(architecture, kind.action_shape, kind.force_signs).state_dict()
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError, UsageError) as error:
         reason = str(error).partition("\n")[0]
-        raise DataError(
-            f"checkpoint {checkpoint.path} has no valid architecture: {reason}"
-        ) from None
+        raise DataError(f"{found} has no valid architecture: {reason}") from None
     expected = {
         name: (str(tensor.dtype).removeprefix("torch."), tuple(tensor.shape))
         for name, tensor in planned.items()
@@ -167,9 +169,7 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
         try:
             read_decays(metadata, kind)
         except (KeyError, TypeError, ValueError) as error:
-            raise DataError(
-                f"checkpoint {checkpoint.path} does not say how its forces fade: {error}"
-            ) from None
+            raise DataError(f"{found} does not say how its forces fade: {error}") from None
     modules = build_modules(architecture, kind.action_shape, kind.force_signs)
     modules.load_state_dict(
         {name: torch.from_numpy(array.copy()) for name, array in checkpoint.tensors.items()}
@@ -189,7 +189,7 @@ def check_metadata(checkpoint: Checkpoint) -> Mapping[str, Any]:
             isinstance(metadata["plant"], str)
             and isinstance(metadata["health"], dict)
             and metadata["settings"]["encoder"]["precision"] in PRECISIONS
-            and metadata["architecture"]["kind"] in CHOICES["kind"]
+            and isinstance(metadata["architecture"]["kind"], str)
             and all(
                 value in CHOICES.get(name, (value,))
                 for name, value in metadata["architecture"].items()
@@ -200,11 +200,19 @@ def check_metadata(checkpoint: Checkpoint) -> Mapping[str, Any]:
         good = False
     if not good:
         raise DataError(f"checkpoint {checkpoint.path} lacks metadata or has malformed ones")
+    if (kind := metadata["architecture"]["kind"]) not in KINDS:
+        try:
+            _extended(kind)
+        except UsageError as error:
+            raise DataError(
+                f"checkpoint {checkpoint.path}: {error.message}",
+                hint="add --plugin with the file of the method that it was trained for",
+            ) from None
     return metadata
 
 
 def tensors_of(modules: nn.ModuleDict) -> dict[str, NDArray[Any]]:
-    """All parameters and buffers as arrays, ready for :func:`save_checkpoint`."""
+    """Return all parameters and buffers as arrays, ready for :func:`save_checkpoint`."""
     return {
         name: tensor.detach().cpu().contiguous().numpy()
         for name, tensor in modules.state_dict().items()
@@ -219,7 +227,7 @@ def encode_frames(
     device: torch.device,
     precision: str,
 ) -> Tensor:
-    """uint8 frames [N, κ, H, W, 3] → float32 embeddings [N, D] on the CPU, in batches."""
+    """Return embeddings [N, D], float32 on the CPU, of uint8 frames [N, κ, H, W, 3]."""
     parts = []
     for start in range(0, len(frames), ENCODE_BATCH):
         batch = frames[start : start + ENCODE_BATCH].to(device)
@@ -229,7 +237,7 @@ def encode_frames(
 
 
 def for_inference(modules: nn.ModuleDict, device: torch.device, precision: str) -> nn.ModuleDict:
-    """A copy that computes the same sooner: batch norms folded, weights cast once for all calls."""
+    """Copy networks to compute the same sooner: batch norms folded, weights cast once for all."""
     networks = copy.deepcopy(modules).to(device).eval()
     for name, network in networks.items():
         if isinstance(network, Encoder):
@@ -242,7 +250,7 @@ def for_inference(modules: nn.ModuleDict, device: torch.device, precision: str) 
 
 
 class Model:
-    """Everything inference needs, from one checkpoint that drives."""
+    """A trained model drives devices: it is its networks and what inference must know of them."""
 
     def __init__(
         self, modules: nn.ModuleDict, metadata: Mapping[str, Any], digest: str, device: str = "auto"
@@ -256,14 +264,6 @@ class Model:
         self.frames: int = self.architecture.get("frames", 2)
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
-        self._planners: dict[str, Planner] = {}
-        levels = levels_of(self.architecture) if self.architecture["kind"] in LEVELS else ()
-        if "medium" in levels:
-            self._planners["hjepa"] = _Hierarchical(self)
-        if "high" in levels:
-            self._planners[f"ts-jepa-{self.strides.h}"] = _Flat(self, "high", self.strides.h)
-        if "flat" in levels:
-            self._planners["ts-jepa-1"] = _Flat(self, "flat", 1)
         is_reflex = self.architecture["kind"] == "reflex"
         self.decays: dict[str, Decay] = read_decays(metadata, kind) if is_reflex else {}
 
@@ -285,17 +285,18 @@ class Model:
         return cls(load_modules(checkpoint), checkpoint.metadata, checkpoint.digest, device)
 
     @property
-    def methods(self) -> tuple[str, ...]:
-        """What this model can drive; P^H alone is TS-JEPA of depth h."""
-        return offered(self.architecture, len(plant(self.plant_name).state_names))
-
-    @property
     def strides(self) -> Strides:
-        """Of a model with predictors."""
-        return Strides(*(self.architecture[name] for name in ("h", "m", "l")))
+        """Return the strides of a model with predictors."""
+        return Strides(*(self.architecture[name] for name in "hml"))
 
     def encode(self, frames: NDArray[np.uint8]) -> Tensor:
-        """Frames uint8 [N, κ, 64, 128, 3], the current one last → embeddings float32 [N, D]."""
+        """Encode frames uint8 [N, κ, 64, 128, 3], the current one last: float32 [N, D].
+
+        Raises:
+            NumericalError: frames that are no uint8 hold what is not finite.
+        """
+        if frames.dtype != np.uint8:
+            finite(frames, "frames")
         return encode_frames(
             functools.partial(read_frames, self.networks),
             torch.from_numpy(frames),
@@ -303,94 +304,26 @@ class Model:
             precision=self.precision,
         )
 
-    def actor(self, z: Tensor) -> Tensor:
-        """Embeddings [N, D] → forces_n [N, *A], clipped to the force limit."""
-        with self.autocast():
-            return self.force_limit_n * self._act(z)
-
-    def single_step(self, z: Tensor, forces_n: Tensor) -> Tensor:
-        """The level of stride 1, ``ts-jepa-1``: z [N, D], forces_n [N, *A] → embeddings [N, D]."""
-        with self.autocast():
-            actions = forces_n.to(self.device).unsqueeze(1) / self.force_limit_n
-            return self.networks["flat"](z, actions)  # type: ignore[no-any-return]
-
-    def planner(self, method: str) -> Planner:
-        """The planner behind ``method``.
+    def act(self, z: Tensor, network: str = "actor") -> Tensor:
+        """Answer embeddings [N, D] with forces ÷ force limit [N, *A], clipped to ±1.
 
         Raises:
-            UsageError: this model does not predict with that method.
+            NumericalError: an embedding is not finite.
         """
-        if method not in self._planners:
-            raise UsageError(
-                f"this model has no planner '{method}'; choose from {', '.join(self._planners)}"
-            )
-        return self._planners[method]
+        if not z.isfinite().all():
+            finite(z.detach().float().cpu(), "z")
+        return self.networks[network].act(z).float()  # type: ignore[no-any-return, operator]
+
+    def actor(self, z: Tensor) -> Tensor:
+        """Answer as :meth:`act`, with forces_n [N, *A] clipped to the force limit."""
+        with self.autocast():
+            return self.force_limit_n * self.act(z)
 
     def law(self, z: Tensor) -> Tensor:
-        """As :meth:`actor`, by the law that ``hold-decay-linear`` fades."""
+        """Answer as :meth:`actor`, by the law that ``hold-decay-linear`` fades."""
         with self.autocast():
-            action: Tensor = self.networks["law"].act(z).float()  # type: ignore[operator]
-            return self.force_limit_n * action
-
-    def reaction(self, method: str) -> Reaction:
-        """The reflex behind ``chunk`` or ``chunk-forces``."""
-        return _Reaction(self, method.replace("-", "_"))
+            return self.force_limit_n * self.act(z, "law")
 
     def autocast(self) -> AbstractContextManager[object]:
-        """The precision that the networks were trained in."""
+        """Compute in the precision that the networks were trained in."""
         return autocast(self.device, self.precision)
-
-    def _act(self, z: Tensor) -> Tensor:
-        return self.networks["actor"].act(z).float()  # type: ignore[no-any-return, operator]
-
-
-class _Hierarchical:
-    """H-JEPA: one coarse stride at a time, filled in by the finer levels."""
-
-    def __init__(self, model: Model) -> None:
-        self._model = model
-        self.stride = model.strides.h
-
-    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        networks = self._model.networks
-        with self._model.autocast():
-            actions, _, z_next = plan_stride(
-                self._model._act,
-                networks["high"],
-                networks["medium"],
-                networks["low"],
-                z,
-                self._model.strides,
-                recompute_anchor=self._model.architecture["stride_actions"] == "all",
-            )
-        return self._model.force_limit_n * actions, z_next
-
-
-class _Flat:
-    """TS-JEPA: one predictor of a fixed depth, the action held in between."""
-
-    def __init__(self, model: Model, name: str, stride: int) -> None:
-        self._model, self._predictor, self.stride = model, model.networks[name], stride
-
-    def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        with self._model.autocast():
-            actions = hold(self._model._act(z), self.stride)
-            return self._model.force_limit_n * actions, self._predictor(z, actions)
-
-
-class _Reaction:
-    """A reflex, in newton."""
-
-    def __init__(self, model: Model, name: str) -> None:
-        reflex = model.networks[name]
-        assert isinstance(reflex, Reflex)
-        self._model, self._reflex = model, reflex
-        self.stride = reflex.shape[0]
-        self.remembers = reflex.longest_age if reflex.sees_forces else 0
-
-    def plan(self, z: Tensor, ages: Tensor, sent_n: Tensor) -> Tensor:
-        limit_n, device = self._model.force_limit_n, self._model.device
-        sent = (sent_n / limit_n).unsqueeze(1).to(device) if self.remembers else None
-        with self._model.autocast():
-            actions = self._reflex.act(z.to(device), ages.unsqueeze(1).to(device), sent)
-            return limit_n * actions.squeeze(1).float()

@@ -1,4 +1,4 @@
-"""What networks offer to a controller: forces from an embedding, some steps at a time."""
+"""Networks offer forces from an embedding to a controller, some steps at a time."""
 
 from typing import Protocol
 
@@ -6,34 +6,29 @@ from torch import Tensor
 
 
 class Planner(Protocol):
-    """Turns embeddings into one stride of forces and the embedding the next stride starts from."""
+    """It turns embeddings into a stride of forces and the embeddings that the next starts from."""
 
     @property
     def stride(self) -> int:
-        """Control steps planned at a time."""
-        ...
+        """Return the control steps planned at a time."""
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Embeddings [n, D] → forces_n [n, stride, *A], next embeddings [n, D]."""
-        ...
+        """Map embeddings [n, D] to forces_n [n, stride, *A] and the next embeddings [n, D]."""
 
 
 class Reaction(Protocol):
-    """Forces from a packet of any age."""
+    """It makes forces from a packet of any age."""
 
     @property
     def stride(self) -> int:
-        """Control steps planned at a time."""
-        ...
+        """Return the control steps planned at a time."""
 
     @property
     def remembers(self) -> int:
-        """How many of the forces sent since the packet it wants to see."""
-        ...
+        """Return how many of the forces sent since the packet it wants to see."""
 
     def plan(self, z: Tensor, ages: Tensor, sent_n: Tensor) -> Tensor:
-        """Embeddings [n, D], ages [n], forces sent [n, remembers, *A] → forces_n [n, stride, *A].
+        """Map embeddings [n, D] of ages [n] to forces_n [n, stride, *A].
 
-        What has not been sent yet is 0.
+        The forces sent since are [n, remembers, *A], 0 where none has been sent yet.
         """
-        ...

@@ -1,4 +1,4 @@
-"""Reflexes: networks that answer a packet of any age with forces, without predicting anything.
+"""Reflexes answer a packet of any age with forces, without predicting anything.
 
 While each packet replaces all that was known, whatever a predictor plays is a function of the last
 packet and its age. A reflex learns that function as it is.
@@ -13,32 +13,25 @@ import torch
 from torch import Tensor, nn
 
 from hjepa_cli.core.networks.actor import SECOND_HIDDEN
-from hjepa_cli.core.networks.symmetry import (
-    MirrorLinear,
-    Signs,
-    Twins,
-    embedding_signs,
-    force_signs,
-)
+from hjepa_cli.core.networks.symmetry import embedding_signs, force_signs, linear_layers
 from hjepa_cli.core.plants.system import System
 
 DECAYS = 8  # of the age: e^(−age/τ) for as many τ, from one step to the longest age
 
 
 class Reflex(nn.Module):
-    """MLP D-1024-256-H whose first hidden layer is scaled, unit by unit, by a function of the age.
+    """In this MLP D-1024-256-H a function of the age scales the first hidden layer, unit by unit.
 
     What is left of a packet after j steps is, near rest, linear in what it said, with factors that
     depend on j: a product, which a network that only adds the age to its inputs would have to make
     from bends.
 
     Args:
-        embedding: D.
-        hidden: width of the first hidden layer.
+        embedding, hidden: D, and the width of the first hidden layer.
         longest_age: A, in steps; older packets are taken to be as old as this.
         forces_at_once: H, the steps that one call plays.
         sees_forces: whether the forces sent since the packet are inputs too.
-        action_shape: of the plant.
+        action_shape: that of the plant.
         mirror: what a mirror does to the forces of a step, a factor for each; then reflected
             embeddings give mirrored forces. ``None``: an ordinary network.
     """
@@ -59,23 +52,17 @@ class Reflex(nn.Module):
         super().__init__()
         self.longest_age, self.sees_forces = longest_age, sees_forces
         self.shape = (forces_at_once, *action_shape)
-        forces = math.prod(action_shape)
-        sent = longest_age * sees_forces
         exponents = torch.arange(DECAYS) / (DECAYS - 1)
         self.register_buffer("decay_rates", float(longest_age) ** -exponents, persistent=False)
         self.mirrored = mirror is not None
         self.scale = nn.Linear(DECAYS + 1, hidden // 2 if self.mirrored else hidden)
-        self.first: nn.Module = nn.Linear(embedding + sent * forces, hidden)
-        self.second: nn.Module = nn.Linear(hidden, SECOND_HIDDEN)
-        self.output: nn.Module = nn.Linear(SECOND_HIDDEN, forces_at_once * forces)
-        if mirror is not None:
-            signs, twins = force_signs(mirror), Twins(hidden)
-            self.first = MirrorLinear(Signs(embedding_signs(embedding) + signs * sent), twins)
-            self.second = MirrorLinear(twins, Twins(SECOND_HIDDEN))
-            self.output = MirrorLinear(Twins(SECOND_HIDDEN), Signs(signs * forces_at_once))
+        forces = force_signs(mirror or (1.0,) * math.prod(action_shape))
+        inputs = embedding_signs(embedding) + forces * (longest_age * sees_forces)
+        parts = inputs, hidden, SECOND_HIDDEN, forces * forces_at_once
+        self.first, self.second, self.output = linear_layers(*parts, mirrored=self.mirrored)
 
     def forward(self, z: Tensor, ages: Tensor, sent: Tensor | None = None) -> Tensor:
-        """Forces ÷ force limit [n, J, H, *A] of the ages j … j + H − 1, unclipped.
+        """Return forces ÷ force limit [n, J, H, *A] of the ages j … j + H − 1, unclipped.
 
         Args:
             z: the last packets' embeddings [n, D].
@@ -96,42 +83,33 @@ class Reflex(nn.Module):
         return forces
 
     def act(self, z: Tensor, ages: Tensor, sent: Tensor | None = None) -> Tensor:
-        """Forces that can be applied: ``forward`` clipped to ±1."""
+        """Return forces that can be applied: ``forward`` clipped to ±1."""
         return torch.clamp(self(z, ages, sent), -1.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Decay:
-    """How the force of a packet fades: s e^(−j/τ) at age j.
+    """The force of a packet fades as s e^(−j/τ) with its age j."""
 
-    Attributes:
-        gain: s.
-        tau_steps: τ.
-    """
-
-    gain: float
-    tau_steps: float
+    gain: float  # s
+    tau_steps: float  # τ
 
 
 def read_decays(metadata: Mapping[str, Any], kind: System) -> dict[str, Decay]:
-    """What a checkpoint's metadata say of ``hold-decay`` and ``hold-decay-linear``.
+    """Return what a checkpoint's metadata say of ``hold-decay`` and ``hold-decay-linear``.
 
     Raises:
         KeyError, TypeError, ValueError: they are not those of a reflex on this plant.
     """
-    actor = metadata["reflex"]
-    law = actor["law"]
-    rows, forces = law["gains_n"], math.prod(kind.action_shape)
+    parts = {"hold-decay": metadata["reflex"], "hold-decay-linear": metadata["reflex"]["law"]}
+    rows, forces = parts["hold-decay-linear"]["gains_n"], math.prod(kind.action_shape)
     if len(rows) != forces or any(len(row) != len(kind.state_names) for row in rows):
         raise ValueError(f"expected gains of {forces} forces on {len(kind.state_names)} states")
     numbers = [value for row in rows for value in row]
-    for part in (actor, law):
+    for part in parts.values():
         numbers += [part["gain"], part["tau_steps"]]
         if part["tau_steps"] <= 0:
             raise ValueError(f"tau_steps = {part['tau_steps']}; expected more than 0")
     if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
         raise ValueError("expected finite numbers")
-    return {
-        name: Decay(float(part["gain"]), float(part["tau_steps"]))
-        for name, part in (("hold-decay", actor), ("hold-decay-linear", law))
-    }
+    return {name: Decay(float(d["gain"]), float(d["tau_steps"])) for name, d in parts.items()}

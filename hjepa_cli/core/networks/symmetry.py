@@ -1,4 +1,4 @@
-"""Networks that commute with a mirror: what they see mirrored, they do mirrored.
+"""These networks commute with a mirror: what they see mirrored, they do mirrored.
 
 A picture flipped left to right shows the plant in its mirrored state, and mirrored forces move that
 one mirrored. The layers here obey this exactly, whatever their weights: nothing that was learned
@@ -14,7 +14,10 @@ parts to odd ones, each on its own (Schur's lemma), at half the multiplications 
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -24,49 +27,55 @@ HALF = 0.5**0.5
 
 
 Runs = tuple[tuple[int, float], ...]
-"""What a mirror does to consecutive values: how many, times 1 or −1; then the next ones."""
+"""Signs of consecutive values: how many a mirror multiplies by 1 or −1; then the next ones."""
 
 
 def embedding_signs(embedding: int) -> Runs:
-    """What a mirror does to an embedding of D values: the first half is even, the second odd."""
+    """Return the signs of an embedding of D values: the first half is even, the second odd."""
     return ((embedding // 2, 1.0), (embedding - embedding // 2, -1.0))
 
 
 def force_signs(mirror: Sequence[float]) -> Runs:
-    """What a mirror does to forces, from a factor for each."""
+    """Return the signs of forces, from a factor for each."""
     return tuple((1, factor) for factor in mirror)
 
 
+def linear_layers(*parts: Runs | int, mirrored: bool) -> list[nn.Module]:
+    """Return the linear layers of a network between vectors: signs as runs, twins as their number.
+
+    Layers that are not ``mirrored`` are ordinary ones. These are drawn in any case: what a seed
+    makes of the rest of a network depends on how many numbers were drawn before.
+    """
+    sizes = [part if isinstance(part, int) else sum(count for count, _ in part) for part in parts]
+    layers: list[nn.Module] = [nn.Linear(*ends) for ends in pairwise(sizes)]
+    if not mirrored:
+        return layers
+    vectors = [Twins(part) if isinstance(part, int) else Signs(part) for part in parts]
+    return [MirrorLinear(*ends) for ends in pairwise(vectors)]
+
+
 def reflect(z: Tensor) -> Tensor:
-    """The embeddings [..., D] of the mirrored pictures."""
+    """Return the embeddings [..., D] of the mirrored pictures."""
     even, odd = z.chunk(2, dim=-1)
     return torch.cat([even, -odd], dim=-1)
 
 
 class Signs(nn.Module):
-    """Vectors [..., n] of which a mirror changes some signs.
-
-    Args:
-        runs: which.
-    """
+    """It splits vectors [..., n] of which a mirror changes some signs."""
 
     order: Tensor
 
     def __init__(self, runs: Runs) -> None:
         super().__init__()
-        parts: dict[bool, list[Tensor]] = {True: [], False: []}
-        start = 0
-        for count, factor in runs:
-            parts[factor > 0].append(torch.arange(start, start + count))
-            start += count
-        self.even, self.odd = (sum(map(len, parts[kind])) for kind in (True, False))
-        order = torch.cat([*parts[True], *parts[False]])
-        kinds = [factor > 0 for _, factor in runs]
-        self._sorted = kinds == sorted(kinds, reverse=True)
-        self.register_buffer("order", order, persistent=False)
+        counts, factors = zip(*runs, strict=True)
+        even = np.repeat(np.array(factors) > 0, counts)
+        order = np.argsort(~even, kind="stable")
+        self.even, self.odd = int(even.sum()), int((~even).sum())
+        self._sorted = bool(even[: self.even].all())
+        self.register_buffer("order", torch.from_numpy(order), persistent=False)
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """[..., n] → even part [..., n_even], odd part [..., n_odd]."""
+        """Return the even part [..., n_even] and the odd one [..., n_odd] of x [..., n]."""
         x = x if self._sorted else x[..., self.order]
         return x[..., : self.even], x[..., self.even :]
 
@@ -77,14 +86,14 @@ class Signs(nn.Module):
 
 
 class Twins(nn.Module):
-    """Vectors [..., n] whose two halves a mirror swaps."""
+    """It splits vectors [..., n] whose two halves a mirror swaps."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
         self.even = self.odd = size // 2
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """[..., n] → sum and difference of the halves, [..., n / 2] each."""
+        """Return sum and difference of the halves of x [..., n], [..., n / 2] each."""
         right, left = x.chunk(2, dim=-1)
         return HALF * (right + left), HALF * (right - left)
 
@@ -94,7 +103,7 @@ class Twins(nn.Module):
 
 
 class MirrorLinear(nn.Module):
-    """A linear layer that commutes with the mirror; the even part alone has a bias."""
+    """This linear layer commutes with the mirror; the even part alone has a bias."""
 
     def __init__(self, inputs: Signs | Twins, outputs: Signs | Twins) -> None:
         super().__init__()
@@ -104,7 +113,7 @@ class MirrorLinear(nn.Module):
         self.odd = nn.Linear(inputs.odd, outputs.odd, bias=False) if outputs.odd else None
 
     def forward(self, x: Tensor) -> Tensor:
-        """[..., n_in] → [..., n_out]."""
+        """Map [..., n_in] to [..., n_out]."""
         even, odd = self.inputs.split(x)
         return self.outputs.join(
             even[..., :0] if self.even is None else self.even(even),
@@ -113,36 +122,27 @@ class MirrorLinear(nn.Module):
 
 
 class MirrorConv2d(nn.Conv2d):
-    """A convolution from twins to twins; arguments as of ``nn.Conv2d``, channels of both halves.
+    """It convolves twins to twins; ``channels`` are those of both halves.
 
     Only the right half's weights exist; the left half sees its twin's inputs through the mirrored
     kernel. With a stride the kernel must be as wide, or the grid of outputs has no mirror image.
     """
 
-    def __init__(
-        self,
-        channels_in: int,
-        channels_out: int,
-        kernel: int,
-        stride: int = 1,
-        padding: int = 0,
-        *,
-        bias: bool = False,
-    ) -> None:
-        super().__init__(channels_in, channels_out // 2, kernel, stride, padding, bias=bias)
+    def __init__(self, channels_in: int, channels_out: int, *grid: Any, **bias: Any) -> None:
+        super().__init__(channels_in, channels_out // 2, *grid, **bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, channels_in, H, W] → [N, channels_out, H', W']."""
+        """Map [N, channels_in, H, W] to [N, channels_out, H', W']."""
         return F.conv2d(x, *self.both_halves(), self.stride, self.padding)
 
     def both_halves(self) -> tuple[Tensor, Tensor | None]:
-        """Weights [channels_out, channels_in, k, k] and bias of the same map, without a twin."""
+        """Return weights [channels_out, channels_in, k, k] and bias of the same map, unshared."""
         own, other = self.weight.chunk(2, dim=1)
         weight = torch.cat([self.weight, torch.cat([other, own], dim=1).flip(-1)])
         return weight, None if self.bias is None else torch.cat([self.bias, self.bias])
 
     def ordinary(self) -> nn.Conv2d:
-        """The same map as an ordinary convolution."""
+        """Return the same map as an ordinary convolution."""
         weight, bias = self.both_halves()
         out, into, kernel, _ = weight.shape
         layer = nn.Conv2d(into, out, kernel, self.stride, self.padding, bias=bias is not None)  # type: ignore[arg-type]
@@ -153,10 +153,10 @@ class MirrorConv2d(nn.Conv2d):
 
 
 class TwinsAsOne(_BatchNorm):
-    """Mixed into a batch norm: one mean, variance, scale and offset for a channel and its twin."""
+    """Mixed into a batch norm, it treats a channel and its twin as one."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, channels, H, W] → the same shape."""
+        """Map [N, channels, H, W] to the same shape."""
         n, channels, height, width = x.shape
         # Channels-last memory: twins are neighbouring pixels of a map twice as wide, for free.
         wide = x.permute(0, 2, 3, 1).reshape(n, height, 2 * width, channels // 2)
@@ -165,13 +165,13 @@ class TwinsAsOne(_BatchNorm):
 
 
 class MirrorNorm2d(TwinsAsOne, nn.BatchNorm2d):
-    """Batch norm of twins; ``channels`` of both halves."""
+    """It normalises twins; ``channels`` are those of both halves."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(channels // 2)
 
     def ordinary(self) -> nn.BatchNorm2d:
-        """The same map, in evaluation mode, as an ordinary batch norm."""
+        """Return the same map, in evaluation mode, as an ordinary batch norm."""
         layer = nn.BatchNorm2d(2 * self.num_features, eps=self.eps).eval()
         both = {
             name: torch.cat([value, value]) if value.dim() else value
@@ -182,7 +182,7 @@ class MirrorNorm2d(TwinsAsOne, nn.BatchNorm2d):
 
 
 class MirrorCentre(nn.Module):
-    """Batch norm of embeddings without affine part; odd values keep their sign, so have mean 0."""
+    """It normalises embeddings, without affine part; odd values have mean 0 and keep their sign."""
 
     def __init__(self, embedding: int) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ class MirrorCentre(nn.Module):
         self.odd = nn.BatchNorm1d(embedding // 2, affine=False)
 
     def forward(self, z: Tensor) -> Tensor:
-        """[N, D] → [N, D]."""
+        """Map [N, D] to [N, D]."""
         even, odd = z.chunk(2, dim=-1)
         # A batch and its mirror image have mean 0, and so has the running mean.
         both = self.odd(torch.cat([odd, -odd]))
@@ -198,12 +198,12 @@ class MirrorCentre(nn.Module):
 
 
 def flatten_twins(x: Tensor) -> Tensor:
-    """Feature maps of twins [N, C, H, W] → twins [N, C · H · W] in no place: none is flipped."""
+    """Map twins' features [N, C, H, W] to twins [N, C · H · W] in no place: none is flipped."""
     right, left = x.chunk(2, dim=1)
     return torch.cat([right.flatten(1), left.flip(-1).flatten(1)], dim=-1)
 
 
 def unflatten_twins(x: Tensor, channels: int, height: int, width: int) -> Tensor:
-    """The inverse of :func:`flatten_twins`: twins [N, C · H · W] → maps of twins [N, C, H, W]."""
+    """Undo :func:`flatten_twins`: map twins [N, C · H · W] to features [N, C, H, W]."""
     right, left = x.reshape(-1, channels, height, width).chunk(2, dim=1)
     return torch.cat([right, left.flip(-1)], dim=1)

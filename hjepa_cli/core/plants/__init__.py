@@ -1,1 +1,1 @@
-"""What is controlled: plants, their teachers and cameras, and what they do over time."""
+"""Plants are what is controlled; each has a teacher and a camera."""

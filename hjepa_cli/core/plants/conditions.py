@@ -1,5 +1,5 @@
-"""How devices may differ from those that everything was trained on: poles, light, camera noise;
-and pictures for training in which light and noise vary.
+"""Devices may differ from those that everything was trained on in poles, light and camera noise;
+pictures for training may vary in light and noise.
 
 Controllers, teachers and the oracle's equations stay the nominal ones: nobody tells them.
 """
@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.settings import Settings
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import Camera, System
 
@@ -24,26 +24,23 @@ _SPLITS = ("train", "test")
 
 
 def altered(settings: Mapping[str, Any]) -> dict[str, float]:
-    """The conditions that are not nominal, of settings as ``as_dict`` gives them or a file holds
-    them."""
+    """Return the conditions that are not nominal, of settings as ``as_dict`` or a file has them."""
     conditions = settings.get("conditions", {})
     return {key: value for key, value in conditions.items() if value != NOMINAL.get(key)}
 
 
 def actual_plant(settings: Settings) -> System:
-    """The plant of the devices.
+    """Return the plant of the devices.
 
     Raises:
         UsageError: longer poles of a plant that has none.
     """
     kind, scale = plant(settings.plant), settings.conditions.pole_length
-    if scale == 1.0:
-        return kind
-    return kind.with_pole_length(scale)
+    return kind if scale == 1.0 else kind.with_pole_length(scale)
 
 
 def actual_camera(settings: Settings) -> Camera:
-    """The camera that looks at them."""
+    """Return the camera that looks at them."""
     camera, conditions = actual_plant(settings).camera(), settings.conditions
     if (conditions.light, conditions.camera_noise) == (1.0, 0.0):
         return camera
@@ -51,51 +48,43 @@ def actual_camera(settings: Settings) -> Camera:
 
 
 class Disturbed:
-    """A camera in another light, with noise of its own in every pixel.
+    """A camera works in another light, with noise of its own in every pixel.
 
-    Args:
-        camera: what it would show.
-        light: factor on all values; clipped at white.
-        noise: standard deviation in steps of 8-bit values.
-        seed: of the noise, which is a function of the states rendered together besides. It does not
-            depend on which process renders them or when, but on who else is in the picture's batch:
-            methods that send at other times do not share it.
+    Values are multiplied by ``light`` and clipped at white; ``noise`` is a standard deviation in
+    steps of 8-bit values. The noise is a function of the seed and of the states rendered together.
+    It does not depend on which process renders them or when, but on who else is in the picture's
+    batch: methods that send at other times do not share it.
     """
 
     def __init__(self, camera: Camera, light: float, noise: float, seed: int) -> None:
         self._camera, self._light, self._noise, self._seed = camera, light, noise, seed
 
-    def render(self, states: ArrayLike) -> NDArray[np.uint8]:
-        """States ``[n, S]`` → RGB frames ``[n, 64, 128, 3]``."""
+    def render(self, states: ArrayLike) -> Pixels:
+        """Return RGB frames ``[n, 64, 128, 3]`` of states ``[n, S]``."""
         drawn = zlib.crc32(np.ascontiguousarray(states, np.float64).tobytes())
         random = generator(self._seed, _NOISE_KEY, drawn)
         return disturbed(self._camera.render(states), self._light, self._noise, random)
 
     def manifest(self) -> dict[str, Any]:
-        """As of any camera."""
+        """Return the camera's manifest with light and noise."""
         return self._camera.manifest() | {"light": self._light, "noise": self._noise}
 
     def sketch_px(self, state: ArrayLike) -> list[Floats]:
-        """As of any camera."""
+        """Return the camera's sketch."""
         return self._camera.sketch_px(state)
 
 
-def disturbed(
-    frames: NDArray[np.uint8], light: float, noise: float, random: np.random.Generator
-) -> NDArray[np.uint8]:
-    """``frames`` of any shape with all values × ``light`` and white noise added, clipped.
-
-    ``noise`` is its standard deviation in steps of 8-bit values.
-    """
+def disturbed(frames: Pixels, light: float, noise: float, random: np.random.Generator) -> Pixels:
+    """Return ``frames`` of any shape with all values × ``light`` and white noise added, clipped."""
     values = np.float32(light) * frames.astype(np.float32)
     if noise:
         values += np.float32(noise) * random.standard_normal(values.shape, np.float32)
-    seen: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    seen: Pixels = np.clip(np.rint(values), 0, 255).astype(np.uint8)
     return seen
 
 
-def vary(frames: NDArray[np.uint8], settings: Settings, split: str) -> NDArray[np.uint8]:
-    """Pictures [N, T, H, W, 3] of ``split``, each trajectory in a light and noise of its own.
+def vary(frames: Pixels, settings: Settings, split: str) -> Pixels:
+    """Return pictures [N, T, H, W, 3], each trajectory in a light and noise of its own.
 
     The light is uniform in 1 ± ``encoder.light_spread``, the noise's standard deviation between 0
     and ``encoder.camera_noise``. Without both, ``frames`` themselves come back.

@@ -1,4 +1,4 @@
-"""The quadratic cost of a step."""
+"""A step has a quadratic cost."""
 
 from collections.abc import Sequence
 
@@ -15,13 +15,10 @@ def stage_cost(
     state_weights: Sequence[float],
     force_weight: float | Sequence[float],
 ) -> Floats:
-    """Quadratic cost min(xᵀQx + uᵀRu, 50) of one step, so that one lost device stays finite.
+    """Return min(xᵀQx + uᵀRu, 50) of one step, capped so that one lost device stays finite.
 
-    Args:
-        states: [..., S] in SI units.
-        forces_n: applied forces [...], or [..., m].
-        state_weights: diagonal of Q, the teacher's.
-        force_weight: R, the teacher's, or its diagonal [m].
+    Q has the diagonal ``state_weights``, R is ``force_weight`` or has that diagonal [m]; states
+    [..., S] are in SI units, the applied forces [...] or [..., m].
     """
     squares = forces_n**2
     effort = squares @ np.asarray(force_weight) if np.ndim(force_weight) else force_weight * squares

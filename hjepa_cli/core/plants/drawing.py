@@ -1,4 +1,4 @@
-"""Anti-aliased rods: enough to draw the camera's picture of a mechanical system.
+"""Anti-aliased rods are enough to draw the camera's picture of a mechanical system.
 
 The cart-pole's own camera computes exact areas; this one is for every other system. What counts is
 the same: a picture must change with the smallest motion, or the encoder sees no velocity.
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
 
 Colour = tuple[int, int, int]
@@ -21,12 +21,10 @@ TOGETHER = 32  # frames drawn at a time: the work stays in the cache
 
 @dataclasses.dataclass(frozen=True)
 class Rod:
-    """A straight rod with round ends.
+    """A straight rod has round ends.
 
-    Attributes:
-        start, end: of its axis, (column, row) in pixels ``[n, 2]``; pixel i spans i … i + 1.
-        width_px: its thickness.
-        colour: RGB.
+    ``start`` and ``end`` of its axis are (column, row) in pixels ``[n, 2]``; pixel i spans
+    i … i + 1.
     """
 
     start: Floats
@@ -35,14 +33,11 @@ class Rod:
     colour: Colour
 
 
-def draw(rods: Sequence[Rod]) -> NDArray[np.uint8]:
-    """Draw rods one over the other, frame by frame.
+def draw(rods: Sequence[Rod]) -> Pixels:
+    """Draw rods one over the other into frames ``[n, 64, 128, 3]``.
 
     A pixel's share of a rod is ½ + (half its width − distance to its axis), within 0 … 1: the area
     of a straight edge through the pixel, up to a small error where it runs diagonally.
-
-    Returns:
-        Frames ``[n, 64, 128, 3]``.
     """
     count = len(rods[0].start)
     frames = np.empty((count, HEIGHT_PX, WIDTH_PX, 3), np.uint8)

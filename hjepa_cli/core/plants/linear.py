@@ -1,4 +1,4 @@
-"""Linear control around an equilibrium: what a step of any system says about its stability.
+"""A step of any system says how stable its equilibrium is, and which linear law holds it there.
 
 Near rest a control step is x_{k+1} = A x_k + B u_k. A and B are taken from the step itself, so that
 a new system needs its equations only.
@@ -19,14 +19,10 @@ MARGIN = 1e-4  # |λ| below 1 + this is drift of an integrator, not growth
 def linearise(
     advance: Callable[[Floats, Floats], Floats], state: Floats, force_n: Floats
 ) -> tuple[Floats, Floats]:
-    """Linearise a control step by central differences.
+    """Return A [S, S] and B [S, m] of a control step, by central differences.
 
-    Args:
-        advance: states [n, S] and forces [n, *A] → states [n, S].
-        state, force_n: where, [S] and [*A].
-
-    Returns:
-        A [S, S] and B [S, m], m forces.
+    ``advance`` maps states [n, S] and forces [n, *A] to states [n, S]; it is linearised at
+    ``state`` [S] and ``force_n`` [*A].
     """
     count, forces = state.size, force_n.size
     nudges = NUDGE * np.concatenate([np.eye(count + forces), -np.eye(count + forces)])
@@ -38,14 +34,14 @@ def linearise(
 
 
 def gains_at_rest(teacher: Callable[[Floats], Floats], states: int) -> Floats:
-    """Gain K [m, S] of the law u = −K x that a teacher [n, S] → [n, *A] follows near rest."""
+    """Return K [m, S] of the law u = −K x that a teacher [n, S] → [n, *A] follows near rest."""
     nudges = NUDGE * np.concatenate([np.eye(states), -np.eye(states)])
     forces_n = teacher(nudges).reshape(2 * states, -1)
     return np.asarray(((forces_n[states:] - forces_n[:states]) / (2 * NUDGE)).T)
 
 
 def unstable_rate_rad_s(a: Floats, step_s: float) -> float:
-    """Sum of the unstable poles' real parts, Σ ln|λ| ÷ step over the eigenvalues |λ| > 1 of A."""
+    """Return the sum of the unstable poles' real parts: Σ ln|λ| ÷ step over |λ| > 1 of A."""
     growth = np.abs(np.linalg.eigvals(a))
     return float(sum(math.log(rate) for rate in growth.tolist() if rate > 1 + MARGIN) / step_s)
 
@@ -53,7 +49,7 @@ def unstable_rate_rad_s(a: Floats, step_s: float) -> float:
 def lqr_gain(
     a: Floats, b: Floats, state_weights: Sequence[float], force_weights: Sequence[float]
 ) -> Floats:
-    """Gain K [m, S] of u = −K x that minimises Σ xᵀQx + uᵀRu, Q and R diagonal."""
+    """Return the gain K [m, S] of u = −K x that minimises Σ xᵀQx + uᵀRu, Q and R diagonal."""
     q, r = np.diag(state_weights), np.diag(force_weights)
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     return np.asarray(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a))

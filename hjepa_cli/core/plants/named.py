@@ -1,4 +1,4 @@
-"""Plants by their names, as users give them."""
+"""Plants are found by their names, as users give them."""
 
 import hashlib
 import inspect
@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from hjepa_cli import plugins
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.settings import Settings
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.arrays import Floats, finite
 from hjepa_cli.core.plants.cartpole import camera
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
@@ -54,7 +54,7 @@ def plant_of(settings: Settings) -> System:
 
 
 def definition(name: str) -> str | None:
-    """What measurements on a plant depend on: the digest of the file that defines it.
+    """Return the digest of the file that defines a plant: measurements depend on it.
 
     ``None`` for the plants of the zoo: :data:`hjepa_cli.core.control.loop.LOOP_VERSION` tells
     theirs apart.
@@ -82,15 +82,11 @@ def cart_pole(which: CartPolePlant | str) -> CartPolePlant:
 
 
 def teacher(preset: System | str) -> Teacher:
-    """Return the teacher of a plant.
+    """Return the teacher of a plant, given as such or by name.
 
-    Args:
-        preset: a plant or its name.
-
-    Returns:
-        A function from states ``[..., S]`` to forces ``[..., *A]`` in N within ± ``force_limit_n``;
-        for a cart-pole from ``[..., 4]`` to ``[...]``
-        (:func:`hjepa_cli.core.plants.cartpole.teacher.sdre`).
+    It is a function from states ``[..., S]`` to forces ``[..., *A]`` in N within ±
+    ``force_limit_n``; for a cart-pole from ``[..., 4]`` to ``[...]``
+    (:func:`hjepa_cli.core.plants.cartpole.teacher.sdre`).
 
     Raises:
         UsageError: unknown plant.
@@ -99,10 +95,7 @@ def teacher(preset: System | str) -> Teacher:
 
 
 class Camera(camera.Camera):
-    """A cart-pole's camera; see :class:`hjepa_cli.core.plants.cartpole.camera.Camera`.
-
-    Args:
-        plant: a plant or its name.
+    """It looks at a cart-pole, given as a plant or its name.
 
     Raises:
         UsageError: unknown plant, or no cart-pole.
@@ -113,12 +106,14 @@ class Camera(camera.Camera):
 
 
 class CartPole:
-    """One cart-pole.
+    """It simulates one cart-pole, given as a plant or by its name, ``"desktop"`` or ``"gym"``.
 
-    Args:
-        preset: a plant or its name, ``"desktop"`` or ``"gym"``.
-        seed: draw the initial state from this seed, uniform within ± :data:`START`; ``None``
-            starts upright and at rest.
+    A ``seed`` draws the initial state, uniform within ± :data:`START`; without one it is upright
+    and at rest.
+
+    Raises:
+        UsageError: unknown plant, or no cart-pole.
+        NumericalError: a state, a force or noise is not finite; the cart-pole stays as it was.
     """
 
     def __init__(self, preset: CartPolePlant | str, *, seed: int | None = None) -> None:
@@ -129,12 +124,12 @@ class CartPole:
 
     @property
     def state(self) -> Floats:
-        """The state ``[4]``: x [m], x_dot [m/s], theta [rad], theta_dot [rad/s]."""
+        """Return the state ``[4]``: x [m], x_dot [m/s], theta [rad], theta_dot [rad/s]."""
         return self._poles.states.reshape(4)
 
     @state.setter
     def state(self, state: ArrayLike) -> None:
-        self._poles.states = np.asarray(state, float).reshape(1, 4)
+        self._poles.states = np.reshape(state, (1, 4))
 
     def step(self, force_n: float, *, noise: ArrayLike | None = None) -> Floats:
         """Advance by one control step and return the new state ``[4]``.
@@ -143,7 +138,8 @@ class CartPole:
             force_n: force on the cart [N], clipped to ± ``plant.force_limit_n``.
             noise: ``[4]`` added to the state after the step; ``None`` adds none.
         """
+        added = None if noise is None else np.broadcast_to(finite(noise, "noise"), 4)
         self._poles.step(np.reshape(force_n, 1))
-        if noise is not None:
-            self.state = self.state + np.asarray(noise, float)
+        if added is not None:
+            self.state = self.state + added
         return self.state

@@ -1,4 +1,4 @@
-"""A quadrotor in a vertical plane, hovering: six states, two forces.
+"""A quadrotor hovers in a vertical plane: it has six states and two forces.
 
 A rigid body with a rotor at each end. The rotors also meet the air sideways: moving along their
 plane, they drag (blade flapping), and because they sit above the centre of mass the drag tilts the
@@ -18,21 +18,22 @@ import functools
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, Pixels, finite
 from hjepa_cli.core.plants.cost import stage_cost
-from hjepa_cli.core.plants.drawing import Rod, draw
+from hjepa_cli.core.plants.drawing import Colour, Rod, draw
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.plants.linear import linearise, lqr_gain
-from hjepa_cli.core.plants.system import Integrated, System, Teacher
+from hjepa_cli.core.plants.system import Integrated, System, Teacher, runge_kutta_step
 
 BODY_RGB, ROTOR_RGB = (0, 114, 178), (160, 0, 0)
+Point = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
 class Quadrotor(System):
-    """The plant, its teacher's weights and its camera's window."""
+    """These numbers fix the plant, its teacher and its camera."""
 
     state_names: ClassVar = ("x", "x_dot", "z", "z_dot", "theta", "theta_dot")
     state_units: ClassVar = ("m", "m/s", "m", "m/s", "rad", "rad/s")
@@ -54,17 +55,13 @@ class Quadrotor(System):
     window_m: float = 1.6  # across; half as high
 
     def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> Integrated:
-        """The equations themselves; ``mass_scale`` is of mass and moment of inertia."""
+        """Simulate by the equations; ``mass_scale`` is of mass and moment of inertia."""
         return Integrated(self, self.advance, devices, mass_scale)
 
     def advance(self, states: Floats, forces_n: Floats, mass_scale: Floats | None = None) -> Floats:
-        """One Runge-Kutta step."""
-        step_s, at = self.step_s, functools.partial(self._rate, forces_n, mass_scale)
-        a = at(states)
-        b = at(states + step_s / 2 * a)
-        c = at(states + step_s / 2 * b)
-        d = at(states + step_s * c)
-        return np.asarray(states + step_s / 6 * (a + 2 * b + 2 * c + d))
+        """Take one Runge-Kutta step."""
+        rate = functools.partial(self._rate, finite(forces_n, "forces_n"), mass_scale)
+        return runge_kutta_step(rate, finite(states, "states"), self.step_s)
 
     def _rate(self, forces_n: Floats, mass_scale: Floats | None, states: Floats) -> Floats:
         mass, inertia = np.moveaxis(np.ones(2) if mass_scale is None else mass_scale, -1, 0)
@@ -80,25 +77,25 @@ class Quadrotor(System):
         return np.stack([x_dot, x_ddot, z_dot, z_ddot, theta_dot, theta_ddot], axis=-1)
 
     def teacher(self) -> Teacher:
-        """The linear quadratic regulator of hovering, clipped."""
+        """Return the linear quadratic regulator of hovering, clipped."""
         return _teacher(self)
 
     def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
-        """The air looks the same everywhere: only x moves."""
+        """Move x only: the air looks the same everywhere."""
         moved = np.array(states, float)
         moved[..., 0] += np.asarray(shift_px) * self.window_m / WIDTH_PX
         return moved
 
     def camera(self) -> "Camera":
-        """See :class:`Camera`."""
+        """Return its camera."""
         return Camera(self)
 
     def in_band(self, states: Floats) -> Bools:
-        """|x| ≤ 0.1 m, |z| ≤ 0.1 m and |θ| ≤ 0.1 rad."""
+        """Say whether |x| ≤ 0.1 m, |z| ≤ 0.1 m and |θ| ≤ 0.1 rad."""
         return np.asarray((np.abs(states) <= self.band).all(axis=-1))
 
     def cost(self, states: Floats, forces_n: Floats) -> Floats:
-        """Quadratic, with the teacher's weights, capped."""
+        """Return the capped quadratic cost with the teacher's weights."""
         return stage_cost(states, forces_n, self.state_weights, self.force_weights)
 
 
@@ -109,54 +106,48 @@ def _teacher(kind: Quadrotor) -> Teacher:
 
     def force_n(states: ArrayLike) -> Floats:
         # Not a matrix product, which would depend on the batch a state comes in.
-        forces = -(np.asarray(states, float)[..., None, :] * gain).sum(axis=-1)
+        forces = -(finite(states, "states")[..., None, :] * gain).sum(axis=-1)
         return np.asarray(forces.clip(-kind.force_limit_n, kind.force_limit_n))
 
     return force_n
 
 
 class Camera:
-    """Stands in front of it and looks at the place where it should hover."""
+    """It stands in front of the plant and looks at the place where that should hover."""
 
     def __init__(self, kind: Quadrotor) -> None:
         self._kind, self._scale_px_m = kind, WIDTH_PX / kind.window_m
 
-    def render(self, states: ArrayLike) -> NDArray[np.uint8]:
-        """States ``[n, 6]`` → frames ``[n, 64, 128, 3]``: beam, masts, rotors."""
-        states = np.asarray(states, float)
+    def render(self, states: ArrayLike) -> Pixels:
+        """Draw states ``[n, 6]`` as beam, masts and rotors: frames ``[n, 64, 128, 3]``."""
+        states = finite(states, "states")
         arm_m, hub_m, blade_m = self._kind.arm_m, self._kind.hub_m, 0.6 * self._kind.arm_m
-        rods = [self._rod(states, (-arm_m, 0), (arm_m, 0), 0.05, BODY_RGB)]
+
+        def rod(start: Point, end: Point, width_m: float, colour: Colour) -> Rod:
+            ends = self._place(states, start), self._place(states, end)
+            return Rod(*ends, width_m * self._scale_px_m, colour)
+
+        rods = [rod((-arm_m, 0), (arm_m, 0), 0.05, BODY_RGB)]
         for side in (-arm_m, arm_m):
-            tip = (side - blade_m, hub_m), (side + blade_m, hub_m)
-            rods.append(self._rod(states, (side, 0), (side, hub_m), 0.03, BODY_RGB))
-            rods.append(self._rod(states, *tip, 0.03, ROTOR_RGB))
+            tips = (side - blade_m, hub_m), (side + blade_m, hub_m)
+            rods.append(rod((side, 0), (side, hub_m), 0.03, BODY_RGB))
+            rods.append(rod(*tips, 0.03, ROTOR_RGB))
         return draw(rods)
 
     def manifest(self) -> dict[str, Any]:
-        """Everything that fixes a picture."""
+        """Return everything that fixes a picture."""
         return {"version": 1, "scale_px_m": self._scale_px_m, "arm_m": self._kind.arm_m,
                 "hub_m": self._kind.hub_m, "body_rgb": list(BODY_RGB),
                 "rotor_rgb": list(ROTOR_RGB)}  # fmt: skip
 
     def sketch_px(self, state: ArrayLike) -> list[Floats]:
-        """The line from rotor to rotor, and the beam's."""
-        states, arm_m, hub_m = np.asarray(state, float)[None], self._kind.arm_m, self._kind.hub_m
+        """Return the line from rotor to rotor, and the beam's."""
+        states, arm_m, hub_m = finite(state, "state")[None], self._kind.arm_m, self._kind.hub_m
         ends = [self._place(states, (side, up)) for up in (hub_m, 0) for side in (-arm_m, arm_m)]
         return [np.concatenate(ends[:2]), np.concatenate(ends[2:])]
 
-    def _rod(
-        self,
-        states: Floats,
-        start: tuple[float, float],
-        end: tuple[float, float],
-        width_m: float,
-        colour: tuple[int, int, int],
-    ) -> Rod:
-        ends = self._place(states, start), self._place(states, end)
-        return Rod(*ends, width_m * self._scale_px_m, colour)
-
-    def _place(self, states: Floats, point_m: tuple[float, float]) -> Floats:
-        """Where a point of the body is in the picture, (column, row) ``[n, 2]``."""
+    def _place(self, states: Floats, point_m: Point) -> Floats:
+        """Return where a point of the body is in the picture, (column, row) ``[n, 2]``."""
         along, up = point_m
         x, z, theta = states[:, 0], states[:, 2], states[:, 4]
         sin, cos = np.sin(theta), np.cos(theta)

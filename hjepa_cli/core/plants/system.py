@@ -1,8 +1,7 @@
-"""What a plant must be for everything else to work with it: a state, a step, a camera, a teacher.
+"""A plant has a state, a step, a camera and a teacher; all else works with any that has them.
 
-Shapes: n devices, S states; A stands for ``action_shape``, which is
-``()`` where one force drives a device and ``(m,)`` where m forces do. So ``[n, *A]`` is ``[n]`` or
-``[n, m]``.
+There are n devices with S states each; A stands for ``action_shape``, which is ``()`` where one
+force drives a device and ``(m,)`` where m forces do. So ``[n, *A]`` is ``[n]`` or ``[n, m]``.
 """
 
 import abc
@@ -12,9 +11,9 @@ from collections.abc import Callable
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, Pixels, finite
 from hjepa_cli.core.plants.linear import linearise, unstable_rate_rad_s
 from hjepa_cli.errors import UsageError
 
@@ -22,32 +21,28 @@ Teacher = Callable[[ArrayLike], Floats]
 
 
 class Simulation(Protocol):
-    """n devices of a system, moved together."""
+    """A simulation moves n devices of a system together."""
 
     @property
     def states(self) -> Floats:
-        """The states ``[n, S]``, which can be set too."""
-        ...
+        """Return the states ``[n, S]``, which can be set too."""
 
     @states.setter
     def states(self, states: ArrayLike) -> None: ...
 
     def step(self, forces_n: ArrayLike) -> None:
         """Advance by one control step under forces ``[n, *A]``, clipped to the limit; no noise."""
-        ...
 
 
 class Integrated:
-    """A simulation by a system's own equations.
+    """It simulates a system by its own equations.
 
-    Args:
-        system: states, forces and their limit.
-        advance: one step: states ``[n, S]``, forces ``[n, *A]``, mass factors ``[n, 2]``.
-        devices: n, at least 1.
-        mass_scale: ``[n, 2]``; ``None`` is 1.
+    ``advance`` makes a step of states ``[n, S]`` under forces ``[n, *A]`` with mass factors
+    ``[n, 2]``, 1 where ``mass_scale`` is ``None``.
 
     Raises:
         UsageError: no devices, or factors that are not positive.
+        NumericalError: states are set, or forces applied, that are not finite.
     """
 
     def __init__(
@@ -63,25 +58,47 @@ class Integrated:
 
     @property
     def states(self) -> Floats:
-        """The states ``[n, S]``."""
+        """Return the states ``[n, S]``."""
         return self._states.copy()
 
     @states.setter
     def states(self, states: ArrayLike) -> None:
-        states = np.array(states, float)
-        if states.shape != self._states.shape:
-            raise ValueError(f"states have shape {states.shape}, not {self._states.shape}")
-        self._states = states
+        self._states = check_states(states, self._states.shape).copy()
 
     def step(self, forces_n: ArrayLike) -> None:
         """Advance by one control step."""
         limit_n = self._system.force_limit_n
-        applied_n = np.clip(np.asarray(forces_n, float), -limit_n, limit_n)
+        applied_n = np.clip(finite(forces_n, "forces_n"), -limit_n, limit_n)
         self._states = self._advance(self._states, applied_n, self._mass_scale)
 
 
+def runge_kutta_step(rate: Callable[[Floats], Floats], states: Floats, duration_s: float) -> Floats:
+    """Return states ``[..., S]`` after one classical fourth-order step.
+
+    ``rate`` maps states to their time derivative, under whatever is held.
+    """
+    a = rate(states)
+    b = rate(states + duration_s / 2 * a)
+    c = rate(states + duration_s / 2 * b)
+    d = rate(states + duration_s * c)
+    return np.asarray(states + duration_s / 6 * (a + 2 * b + 2 * c + d))
+
+
+def check_states(states: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """Return states as float64.
+
+    Raises:
+        ValueError: their shape is another one.
+        NumericalError: one is not finite.
+    """
+    checked = finite(states, "states")
+    if checked.shape != shape:
+        raise ValueError(f"states have shape {checked.shape}, not {shape}")
+    return checked
+
+
 def check_masses(devices: int, mass_scale: ArrayLike | None) -> Floats:
-    """Mass factors ``[devices, 2]``, all 1 for ``None``.
+    """Return mass factors ``[devices, 2]``, all 1 for ``None``.
 
     Raises:
         UsageError: no devices, or factors that are not positive.
@@ -95,34 +112,33 @@ def check_masses(devices: int, mass_scale: ArrayLike | None) -> Floats:
 
 
 class Camera(Protocol):
-    """Sees a system from the side."""
+    """A camera sees a system from the side."""
 
-    def render(self, states: ArrayLike) -> NDArray[np.uint8]:
-        """States ``[n, S]`` → RGB frames ``[n, 64, 128, 3]``."""
-        ...
+    def render(self, states: ArrayLike) -> Pixels:
+        """Return RGB frames ``[n, 64, 128, 3]`` of states ``[n, S]``.
+
+        Raises:
+            NumericalError: a state is not finite.
+        """
 
     def manifest(self) -> dict[str, Any]:
-        """All that fixes a picture besides the state, as plain data; ``version`` among it."""
-        ...
+        """Return all that fixes a picture besides the state, plain; ``version`` among it."""
 
     def sketch_px(self, state: ArrayLike) -> list[Floats]:
-        """A state ``[S]`` as lines through points ``[k, 2]`` (column, row) of its picture.
+        """Return a state ``[S]`` as lines through points ``[k, 2]`` (column, row) of its picture.
 
         Drawn over a picture to show what a controller believes; the first line is the axis whose
         lean matters.
         """
-        ...
 
 
 def same_camera(recorded: object, system: "System") -> bool:
-    """Whether pictures are those of the system's camera, by the manifest that a file holds."""
+    """Say whether a file's pictures are of the system's camera, by the manifest that it holds."""
     return bool(recorded == json.loads(json.dumps(system.camera().manifest())))
 
 
 class System(abc.ABC):
-    """A kind of plant, with its teacher, its camera and the score of its control.
-
-    Everything is batched: whatever takes states takes any leading axes.
+    """A kind of plant has a teacher, a camera and a score; states have any leading axes.
 
     Attributes:
         name: as in ``--plant``.
@@ -135,8 +151,6 @@ class System(abc.ABC):
         mirror: what a mirrored picture does to the forces: a factor for each.
     """
 
-    extends: ClassVar[str] = "plant"
-
     name: str
     step_s: float
     force_limit_n: float
@@ -147,7 +161,7 @@ class System(abc.ABC):
 
     @abc.abstractmethod
     def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> Simulation:
-        """``devices`` of them, at rest; ``mass_scale`` ``[n, 2]`` are factors on two masses each.
+        """Return ``devices`` of them at rest; ``mass_scale`` ``[n, 2]`` are factors on two masses.
 
         Raises:
             UsageError: no devices, or factors that are not positive.
@@ -155,26 +169,30 @@ class System(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, states: Floats, forces_n: Floats) -> Floats:
-        """Exact equations of one control step: states ``[..., S]``, forces ``[..., *A]``."""
+        """Return states ``[..., S]`` one control step on under forces ``[..., *A]``, exactly.
+
+        Raises:
+            NumericalError: a state or a force is not finite.
+        """
 
     @abc.abstractmethod
     def teacher(self) -> Teacher:
-        """The controller to learn from: states ``[..., S]`` → forces ``[..., *A]`` in N."""
+        """Return what to learn from, a function of states ``[..., S]``: forces_n ``[..., *A]``."""
 
     @abc.abstractmethod
     def camera(self) -> Camera:
-        """The camera that looks at it."""
+        """Return the camera that looks at it."""
 
     @abc.abstractmethod
     def in_band(self, states: Floats) -> Bools:
-        """Score of a step: whether states ``[..., S]`` are where they should be, ``[...]``."""
+        """Score a step: say whether states ``[..., S]`` are where they should be, ``[...]``."""
 
     @abc.abstractmethod
     def cost(self, states: Floats, forces_n: Floats) -> Floats:
-        """Quadratic cost of a step, capped; see :func:`hjepa_cli.core.plants.cost.stage_cost`."""
+        """Return a step's quadratic cost; see :func:`hjepa_cli.core.plants.cost.stage_cost`."""
 
     def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
-        """States ``[..., S]`` whose pictures are those of ``states``, moved right by ``[...]`` px.
+        """Return the states ``[..., S]`` whose pictures are those of ``states``, moved right.
 
         Training needs it to move pictures (``shift_px``) and to ask the teacher what it would do
         there.
@@ -188,7 +206,7 @@ class System(abc.ABC):
         )
 
     def with_pole_length(self, scale: float) -> "System":
-        """The same plant with a pole ``scale`` times as long.
+        """Return the same plant with a pole ``scale`` times as long.
 
         Raises:
             UsageError: it has none.
@@ -199,20 +217,20 @@ class System(abc.ABC):
 
     @property
     def unstable_rate_rad_s(self) -> float:
-        """λ, the sum of the unstable poles at rest [rad/s], from the exact equations."""
+        """Return λ, the sum of the unstable poles at rest [rad/s], from the exact equations."""
         still = np.zeros(len(self.state_names)), np.zeros(self.action_shape)
         return unstable_rate_rad_s(linearise(self.advance, *still)[0], self.step_s)
 
     @property
     def data_rate_limit_bits_per_s(self) -> float:
-        """λ/ln 2: no controller stabilises it from fewer bit/s (data-rate theorem)."""
+        """Return λ/ln 2: no controller stabilises it from fewer bit/s (data-rate theorem)."""
         return self.unstable_rate_rad_s / math.log(2)
 
     @property
     def force_signs(self) -> tuple[float, ...]:
-        """:attr:`mirror` as one factor for each force."""
+        """Return :attr:`mirror` as one factor for each force."""
         return tuple(np.ravel(self.mirror).tolist())
 
     def no_force(self, devices: int) -> Floats:
-        """Forces of ``devices`` devices that do nothing, ``[n, *A]``."""
+        """Return forces that do nothing to ``devices`` devices, ``[n, *A]``."""
         return np.zeros((devices, *self.action_shape))

@@ -1,1 +1,1 @@
-"""The radio cell: links, codes, schedulers and laws of sharing."""
+"""A radio cell has links, codes, schedulers and laws of sharing."""

@@ -1,4 +1,4 @@
-"""The uplink channel: indoor-factory path loss, Rayleigh block fading, rate and outage.
+"""The uplink channel has indoor-factory path loss, Rayleigh block fading, rate and outage.
 
 Large scale: 3GPP TR 38.901, indoor factory (InF), clauses 7.4.1 and 7.4.2. Small scale, rate and
 outage: the paper's system model, eqs. 2 to 4. Distances in metres, carrier in GHz, powers in dBm,
@@ -7,24 +7,25 @@ input. ``docs/radio.md`` lists the assumptions.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from hjepa_cli.config.checks import CARRIER_GHZ
+from hjepa_cli.config.schema import CARRIER_GHZ
+from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.errors import UsageError
-
-FloatArray = npt.NDArray[np.float64]
 
 DISTANCE_3D_M = (1.0, 600.0)  # validity of Table 7.4.1-1 for InF
 SNR_DB = (-100.0, 100.0)  # ours: wider than any link, narrow enough that nothing overflows
+ROUNDING = 1e-12  # what lies (relatively) this close to a bound or a whole number is that number
 THERMAL_NOISE_DBM_PER_HZ = -174.0  # kT at 290 K, rounded as in every link budget
 
 
 @dataclass(frozen=True)
 class PathLoss:
-    """One row of Table 7.4.1-1: intercept + distance·log10(d/m) + frequency·log10(f/GHz) in dB.
+    """Holds a row of Table 7.4.1-1: intercept + distance·log10(d/m) + frequency·log10(f/GHz) in dB.
 
     ``never_below`` names the rows whose loss is a lower bound of this one: clutter can only add.
     """
@@ -35,7 +36,7 @@ class PathLoss:
     shadowing_db: float  # standard deviation of the log-normal shadow fading
     never_below: tuple[str, ...] = ()
 
-    def mean_db(self, carrier_ghz: FloatArray, distance_3d_m: FloatArray) -> FloatArray:
+    def mean_db(self, carrier_ghz: Floats, distance_3d_m: Floats) -> Floats:
         """Return the row's own loss, before its lower bounds."""
         slope = self.distance_db * np.log10(distance_3d_m)
         return np.asarray(
@@ -53,9 +54,7 @@ SCENARIOS = {
 }
 
 
-def path_loss_db(
-    scenario: str, carrier_ghz: npt.ArrayLike, distance_3d_m: npt.ArrayLike
-) -> FloatArray:
+def path_loss_db(scenario: str, carrier_ghz: npt.ArrayLike, distance_3d_m: npt.ArrayLike) -> Floats:
     """Return the median path loss in dB (TR 38.901 Table 7.4.1-1), without shadow fading.
 
     Args:
@@ -66,13 +65,20 @@ def path_loss_db(
     Raises:
         UsageError: unknown scenario, or a frequency or distance outside the standard's range.
     """
-    row = _row(scenario)
-    carrier = _within("carrier frequency", carrier_ghz, *CARRIER_GHZ, "GHz")
-    distance = _within("3D distance", distance_3d_m, *DISTANCE_3D_M, "m")
+    row = path_loss_row(scenario)
+    carrier = _within("carrier frequency", carrier_ghz, CARRIER_GHZ, "GHz")
+    distance = _within("3D distance", distance_3d_m, DISTANCE_3D_M, "m")
     loss = row.mean_db(carrier, distance)
     for bound in row.never_below:
         loss = np.maximum(loss, SCENARIOS[bound].mean_db(carrier, distance))
     return loss[()]
+
+
+def path_loss_row(scenario: str) -> PathLoss:
+    """Return the row of a scenario. Raises UsageError for one that there is not."""
+    if scenario not in SCENARIOS:
+        raise UsageError(f"unknown scenario {scenario!r}; choose one of {', '.join(SCENARIOS)}")
+    return SCENARIOS[scenario]
 
 
 def line_of_sight_probability(
@@ -84,7 +90,7 @@ def line_of_sight_probability(
     clutter_height_m: npt.ArrayLike,
     bs_height_m: npt.ArrayLike,
     ue_height_m: npt.ArrayLike,
-) -> FloatArray:
+) -> Floats:
     """Return the probability that a link is in line of sight (TR 38.901 Table 7.4.2-1).
 
     P = exp(−d_2D / k) with k = −d_clutter / ln(1 − r), times (h_BS − h_UT) / (h_c − h_UT) for a
@@ -95,31 +101,25 @@ def line_of_sight_probability(
         scenario: a key of :data:`SCENARIOS`.
         distance_2d_m: horizontal distance, ≥ 0.
         clutter_density: r, the fraction of the floor covered, 0 ≤ r < 1.
-        clutter_size_m: d_clutter, typical size of a clutter object.
-        clutter_height_m: h_c, effective clutter height.
-        bs_height_m: h_BS, base-station antenna height.
-        ue_height_m: h_UT, device antenna height.
+        clutter_size_m, clutter_height_m: d_clutter and h_c, typical of a clutter object.
+        bs_height_m, ue_height_m: h_BS and h_UT, of the antennas of base station and device.
 
     Raises:
         UsageError: a value out of range; for SH and DH also clutter that is not above the device
             (there the formula has no meaning) or a base station below the clutter (that is SL, DL).
     """
-    _row(scenario)
+    path_loss_row(scenario)  # refuses what is no scenario
     distance = _at_least_0("2D distance", distance_2d_m)
-    density = _within("clutter density", clutter_density, 0.0, np.nextafter(1.0, 0.0), "(r < 1)")
-    size = _positive("clutter size", clutter_size_m)
+    allowed = "0 … 1 (r < 1)"
+    density = _checked("clutter density", clutter_density, allowed, lambda r: (r >= 0) & (r < 1))
+    size = positive("clutter size", clutter_size_m)
     if scenario == "InF-LOS":
         return np.ones(np.broadcast(distance, density, size).shape)[()]
     decay_per_m = -np.log1p(-density) / size  # 1/k, so that an empty hall (r = 0) gives P = 1
     if scenario in ("InF-SH", "InF-DH"):
-        clutter, bs, ue = (
-            _at_least_0(name, value)
-            for name, value in (
-                ("clutter height", clutter_height_m),
-                ("base-station height", bs_height_m),
-                ("device height", ue_height_m),
-            )
-        )
+        clutter = _at_least_0("clutter height", clutter_height_m)
+        bs = _at_least_0("base-station height", bs_height_m)
+        ue = _at_least_0("device height", ue_height_m)
         if np.any(clutter <= ue):
             raise UsageError(
                 f"clutter height {np.min(clutter):g} m is not above the device at "
@@ -134,9 +134,9 @@ def line_of_sight_probability(
     return np.asarray(np.exp(-distance * decay_per_m))[()]
 
 
-def thermal_noise_dbm(bandwidth_hz: npt.ArrayLike, noise_figure_db: npt.ArrayLike) -> FloatArray:
+def thermal_noise_dbm(bandwidth_hz: npt.ArrayLike, noise_figure_db: npt.ArrayLike) -> Floats:
     """Return the noise power −174 dBm/Hz + 10 log10 W + F in dBm."""
-    bandwidth = _positive("bandwidth", bandwidth_hz)
+    bandwidth = positive("bandwidth", bandwidth_hz)
     figure = np.asarray(noise_figure_db, np.float64)
     return np.asarray(THERMAL_NOISE_DBM_PER_HZ + 10.0 * np.log10(bandwidth) + figure)[()]
 
@@ -146,21 +146,18 @@ def received_snr_db(
     loss_db: npt.ArrayLike,
     noise_dbm: npt.ArrayLike,
     power_gain: npt.ArrayLike = 1.0,
-) -> FloatArray:
+) -> Floats:
     """Return γ = 10^(−PL/10) P |H|² / N_c in dB (paper, eq. 2).
 
-    Args:
-        power_dbm: P, transmit power.
-        loss_db: PL, e.g. from :func:`path_loss_db`.
-        noise_dbm: N_c, e.g. from :func:`thermal_noise_dbm`.
-        power_gain: |H|², linear; 1 gives the mean SNR.
+    The arguments are P, PL as from :func:`path_loss_db`, N_c as from :func:`thermal_noise_dbm`, and
+    |H|², linear; 1 gives the mean SNR.
     """
     link = np.asarray(power_dbm, np.float64) - np.asarray(loss_db) - np.asarray(noise_dbm)
     with np.errstate(divide="ignore"):  # a gain of 0 is −∞ dB
         return np.asarray(link + 10.0 * np.log10(_at_least_0("power gain", power_gain)))[()]
 
 
-def rayleigh_power_gains(rng: np.random.Generator, shape: int | tuple[int, ...]) -> FloatArray:
+def rayleigh_power_gains(rng: np.random.Generator, shape: int | tuple[int, ...]) -> Floats:
     """Draw |H|² ~ Exp(1): the power gain of unit-mean Rayleigh fading.
 
     Block fading (paper, section II-B): one value per device and control step τ_o, independent
@@ -169,15 +166,15 @@ def rayleigh_power_gains(rng: np.random.Generator, shape: int | tuple[int, ...])
     return rng.standard_exponential(shape)
 
 
-def achievable_rate_bps(bandwidth_hz: npt.ArrayLike, snr_db: npt.ArrayLike) -> FloatArray:
+def achievable_rate_bps(bandwidth_hz: npt.ArrayLike, snr_db: npt.ArrayLike) -> Floats:
     """Return the capacity W log2(1 + γ) in bit/s (paper, eq. 3)."""
-    bandwidth = _positive("bandwidth", bandwidth_hz)
+    bandwidth = positive("bandwidth", bandwidth_hz)
     return np.asarray(bandwidth * np.log1p(snr_ratio(snr_db)) / math.log(2.0))[()]
 
 
 def outage_probability(
     rate_bps: npt.ArrayLike, bandwidth_hz: npt.ArrayLike, mean_snr_db: npt.ArrayLike
-) -> FloatArray:
+) -> Floats:
     """Return ε = P[W log2(1 + γ̄ |H|²) < R̄] = 1 − exp(−(2^(R̄/W) − 1) / γ̄) (paper, eq. 4).
 
     Args:
@@ -186,49 +183,44 @@ def outage_probability(
         mean_snr_db: γ̄ = 10^(−PL/10) P / N_c, the SNR averaged over the fading.
     """
     rate = _at_least_0("rate", rate_bps)
-    bandwidth = _positive("bandwidth", bandwidth_hz)
+    bandwidth = positive("bandwidth", bandwidth_hz)
     with np.errstate(over="ignore"):  # a hopeless rate overflows to ∞: outage 1
         needed_snr = np.expm1(rate / bandwidth * math.log(2.0))
         return np.asarray(-np.expm1(-needed_snr / snr_ratio(mean_snr_db)))[()]
 
 
-def snr_ratio(snr_db: npt.ArrayLike) -> FloatArray:
+def snr_ratio(snr_db: npt.ArrayLike) -> Floats:
     """Return the SNR as a power ratio, refusing what is not a number of dB within ±100."""
-    return np.asarray(10.0 ** (_within("SNR", snr_db, *SNR_DB, "dB") / 10.0))
+    return np.asarray(10.0 ** (_within("SNR", snr_db, SNR_DB, "dB") / 10.0))
 
 
-def _row(scenario: str) -> PathLoss:
-    if scenario not in SCENARIOS:
-        raise UsageError(f"unknown scenario {scenario!r}; choose one of {', '.join(SCENARIOS)}")
-    return SCENARIOS[scenario]
+def positive(name: str, value: npt.ArrayLike) -> Floats:
+    """Return finite values above 0 as an array; raise UsageError for any other."""
+    return _checked(name, value, "a finite value above 0", lambda v: (v > 0) & np.isfinite(v))
 
 
-def _within(name: str, value: npt.ArrayLike, low: float, high: float, unit: str) -> FloatArray:
-    values = _numbers(name, value)
-    _refuse(name, values, ~((values >= low) & (values <= high)), f"{low:g} … {high:g} {unit}")
-    return values
+def _at_least_0(name: str, value: npt.ArrayLike) -> Floats:
+    allowed = "a finite value of 0 or more"
+    return _checked(name, value, allowed, lambda v: (v >= 0) & np.isfinite(v))
 
 
-def _positive(name: str, value: npt.ArrayLike) -> FloatArray:
-    values = _numbers(name, value)
-    _refuse(name, values, ~((values > 0) & np.isfinite(values)), "a finite value above 0")
-    return values
+def _within(name: str, value: npt.ArrayLike, bounds: tuple[float, float], unit: str) -> Floats:
+    """Return values within bounds; those that only rounding put outside are put on the bound."""
+    low, high = bounds[0] - ROUNDING * abs(bounds[0]), bounds[1] + ROUNDING * abs(bounds[1])
+    allowed = f"{bounds[0]:g} … {bounds[1]:g} {unit}"
+    values = _checked(name, value, allowed, lambda v: (v >= low) & (v <= high))
+    return np.asarray(np.clip(values, *bounds))
 
 
-def _at_least_0(name: str, value: npt.ArrayLike) -> FloatArray:
-    values = _numbers(name, value)
-    _refuse(name, values, ~((values >= 0) & np.isfinite(values)), "a finite value of 0 or more")
-    return values
-
-
-def _numbers(name: str, value: npt.ArrayLike) -> FloatArray:
+def _checked(
+    name: str, value: npt.ArrayLike, allowed: str, right: Callable[[Floats], Bools]
+) -> Floats:
+    """Return values as an array; raise UsageError for the first that is not right, like NaN."""
     try:
-        return np.asarray(value, np.float64)
+        values = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         raise UsageError(f"{name} {value!r} is not a number") from None
-
-
-def _refuse(name: str, values: FloatArray, wrong: npt.NDArray[np.bool_], allowed: str) -> None:
-    """Raise for the first element that is out of range (comparisons with nan count as wrong)."""
+    wrong = ~right(values)
     if np.any(wrong):
         raise UsageError(f"{name} {values[wrong].flat[0]:g} is out of range; use {allowed}")
+    return values

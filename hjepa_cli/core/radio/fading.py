@@ -1,4 +1,4 @@
-"""Small-scale fading: power gains |H|² of many links over many slots, and the losses they cause.
+"""Small-scale fading gives power gains |H|² of many links over many slots, and causes losses.
 
 A gain holds for one slot or longer. With a coherence of T slots each link draws a new gain with
 probability 1/T at every slot (block fading with geometric block lengths, mean T): T = 1 is the
@@ -13,10 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hjepa_cli.compute.seeding import generator
+from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.errors import UsageError
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 CHUNK_SLOTS = 256  # drawn at a time: memory does not grow with the number of slots
 _FADING_KEY = 0xFAD
@@ -24,14 +22,12 @@ _FADING_KEY = 0xFAD
 
 def rician_power_gains(
     rng: np.random.Generator, shape: tuple[int, ...], k_factor_db: npt.ArrayLike
-) -> FloatArray:
+) -> Floats:
     """Draw |H|² of unit-mean Rician fading: |√(K/(K+1)) + √(1/(K+1)) CN(0, 1)|².
 
-    Args:
-        rng: random stream.
-        shape: of the result; ``k_factor_db`` broadcasts to it.
-        k_factor_db: power of the line of sight over that of the scattered paths. −∞ is Rayleigh
-            fading, |H|² ~ Exp(1); TR 38.901 Table 7.5-6 has 7 ± 8 dB for InF in sight.
+    K, which broadcasts to the shape, is the power of the line of sight over that of the scattered
+    paths. −∞ dB is Rayleigh fading, |H|² ~ Exp(1); TR 38.901 Table 7.5-6 has 7 ± 8 dB for InF in
+    sight.
     """
     scattered = 1.0 / (10.0 ** (np.asarray(k_factor_db, np.float64) / 10.0) + 1.0)
     real, imaginary = np.moveaxis(rng.standard_normal((*shape, 2)), -1, 0)
@@ -41,20 +37,19 @@ def rician_power_gains(
 
 def block_fading(
     seed: int, links: int, *, k_factor_db: npt.ArrayLike = -np.inf, coherence_slots: float = 1.0
-) -> Iterator[FloatArray]:
+) -> Iterator[Floats]:
     """Yield the power gains [links] of one slot after the other, forever.
 
-    Args:
-        seed: two iterators of one seed give the same gains; link i of n is link i of any m > i.
-        links: how many.
-        k_factor_db: Rician K of each link [links] or of all; −∞ is Rayleigh.
-        coherence_slots: T ≥ 1, mean number of slots a gain lasts.
+    Two iterators of one seed give the same gains; link i of n is link i of any m > i. The Rician K
+    is that of each link [links] or of all; a gain lasts T ≥ 1 slots on average.
 
     Raises:
         UsageError: a coherence shorter than a slot.
     """
     k_factor_db = np.broadcast_to(np.asarray(k_factor_db, np.float64), links)[:, None]
-    renewal = 1.0 / _at_least_one("coherence", coherence_slots)
+    if not 1.0 <= coherence_slots < np.inf:
+        raise UsageError(f"coherence of {coherence_slots:g} slots; it is 1 slot or longer")
+    renewal = 1.0 / coherence_slots
     gains = np.zeros(links)
     chunk = 0
     while True:
@@ -69,8 +64,8 @@ def block_fading(
         chunk += 1
 
 
-def gilbert_elliott(uniforms: FloatArray, delivery: float, burst_slots: float) -> BoolArray:
-    """Deliveries of a two-state channel: what gets through when losses come in bursts.
+def gilbert_elliott(uniforms: Floats, delivery: float, burst_slots: float) -> Bools:
+    """Return what a two-state channel delivers, whose losses come in bursts: bool [slots, links].
 
     Good slots deliver, bad ones do not. The chain starts in its stationary state and leaves a bad
     slot with probability 1/B, a good one with (1 − p)/(p B), so that a share p of all slots is good
@@ -81,9 +76,6 @@ def gilbert_elliott(uniforms: FloatArray, delivery: float, burst_slots: float) -
         delivery: p in (0, 1], the long-run share of good slots.
         burst_slots: B, mean length of a run of losses; at least 1 and at least (1 − p)/p, beyond
             which a good state would have to be left before it is entered.
-
-    Returns:
-        bool [slots, links].
 
     Raises:
         UsageError: p outside (0, 1], or a B that no such channel has.
@@ -105,14 +97,3 @@ def gilbert_elliott(uniforms: FloatArray, delivery: float, burst_slots: float) -
             state = np.where(state, drawn >= becomes_bad, drawn >= stays_bad)
         good[slot] = state
     return good
-
-
-def burst_of_fading(blocked: float, coherence_slots: float) -> float:
-    """Mean run of slots below a threshold, T / (1 − q), that a gain is below with probability q."""
-    return _at_least_one("coherence", coherence_slots) / (1.0 - blocked)
-
-
-def _at_least_one(name: str, slots: float) -> float:
-    if not 1.0 <= slots < np.inf:
-        raise UsageError(f"{name} of {slots:g} slots; it is 1 slot or longer")
-    return float(slots)

@@ -1,4 +1,4 @@
-"""The shared uplink: who may send in each slot, and what the base station knows of the devices.
+"""The shared uplink says who may send in each slot, and what the base station knows.
 
 J resource blocks a slot, each one transmission long. Power control holds every transmission at the
 target SNR; a device in a fade deeper than its power margin cannot send at all.
@@ -6,21 +6,19 @@ target SNR; a device in a fade deeper than its power margin cannot send at all.
 
 import dataclasses
 import math
-from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.core.arrays import Bools, Floats
-from hjepa_cli.core.control.disagreement import Levels
-from hjepa_cli.core.control.error_growth import Growth
+from hjepa_cli.core.control.disagreement import LevelDisagreement
+from hjepa_cli.core.control.error_growth import ErrorGrowthTable
 from hjepa_cli.core.radio.fading import block_fading
-from hjepa_cli.core.radio.schedulers import REPORTING, SCHEDULERS, pick
-from hjepa_cli.core.radio.schedulers.view import View
+from hjepa_cli.core.radio.schedulers.scheduler import SlotView, pick
 from hjepa_cli.errors import UsageError
+from hjepa_cli.plugins import SCHEDULERS
 
-LEVEL_BITS = 8  # of a reported innovation
+INNOVATION_BITS = 8  # of a report
 CHECK_PERIOD = 8  # slots between a device's looks at its own camera, staggered over devices
 REPORT_AGAIN = 2.0  # times the last report: an innovation is reported once, and when it doubles
 REPORTS_PER_BLOCK = 1.0  # that δ is steered to: a candidate for every transmission
@@ -31,19 +29,19 @@ DELTA = (1e-3, 0.5)  # range of δ, in parts of the force range
 
 @dataclasses.dataclass(frozen=True)
 class Access:
-    """How the devices of one block share it.
+    """Holds the rules by which devices share blocks.
 
     Attributes:
-        scheduler: a name of :data:`~hjepa_cli.core.radio.schedulers.SCHEDULERS`.
+        scheduler: its name.
         blocks: J, transmissions per slot.
         margin_db: G, of each device or all: fades deeper than this block a device; ∞ blocks nobody.
-        k_factor_db: Rician K, of each device or all; −∞ is Rayleigh.
+        k_factor_db: Rician K, likewise; −∞ is Rayleigh.
         coherence_slots: mean slots a fade lasts.
         round_errors: share of transmissions that fail although the power sufficed: of first copies
             of a sample, of second ones (the copies combined), … One entry: none is repeated.
         growth: of the control error with age, measured for the controller.
         seed: of the fading.
-        levels: scales the growth by the disagreement of a controller's levels.
+        levels: scales the growth by the disagreement of a controller's two levels, if it has them.
     """
 
     scheduler: str
@@ -52,40 +50,32 @@ class Access:
     k_factor_db: float | Floats
     coherence_slots: float
     round_errors: tuple[float, ...]
-    growth: Growth
+    growth: ErrorGrowthTable
     seed: int
-    levels: Levels | None = None
+    levels: LevelDisagreement | None = None
 
 
 def report_bits(devices: int) -> int:
-    """Bits of one innovation report in a cell of N devices: 8 for the level, ⌈log2 N⌉ for who."""
-    return LEVEL_BITS + math.ceil(math.log2(max(devices, 1)))
+    """Return the bits of a report in a cell of N devices: 8 for how far, ⌈log2 N⌉ for who."""
+    return INNOVATION_BITS + math.ceil(math.log2(max(devices, 1)))
 
 
 class Uplink:
-    """The uplink's state from slot to slot. Per slot: :meth:`begin`, maybe :meth:`hear`, grant.
-
-    Args:
-        access: see :class:`Access`.
-        devices: N.
+    """Keeps the state of N devices; in each slot :meth:`begin`, maybe :meth:`hear`, then grant.
 
     Raises:
         UsageError: unknown scheduler, or more blocks than devices.
     """
 
     def __init__(self, access: Access, devices: int) -> None:
-        if access.scheduler not in SCHEDULERS:
-            raise UsageError(
-                f"unknown scheduler '{access.scheduler}'; choose from {', '.join(SCHEDULERS)}"
-            )
+        scheduler = SCHEDULERS[access.scheduler]
         if not 1 <= access.blocks <= devices:
             raise UsageError(
                 f"{access.blocks} resource blocks for {devices} devices; use 1 to {devices}"
             )
         self._access = access
-        self._score = SCHEDULERS[access.scheduler]
-        self.listens = access.scheduler in REPORTING
-        self._fading: Iterator[Floats] = block_fading(
+        self._score, self.listens = scheduler.score, scheduler.wants_reports
+        self._fading = block_fading(
             access.seed,
             devices,
             k_factor_db=access.k_factor_db,
@@ -93,7 +83,8 @@ class Uplink:
         )
         self._errors = generator(access.seed, _ERRORS_KEY)
         self._round_errors = np.array(access.round_errors)
-        self._threshold = 10.0 ** (-_each(access.margin_db, devices) / 10.0)
+        margin_db = np.broadcast_to(np.asarray(access.margin_db, np.float64), devices)
+        self._threshold = 10.0 ** (-margin_db / 10.0)
         self._fair_age = devices / access.blocks
         self._slot = 0
         self._delta = 0.02
@@ -105,7 +96,7 @@ class Uplink:
         self._waited = np.arange(devices, 0, -1)
         self._queue = np.zeros(devices)
         self._reported = np.zeros(devices)
-        self._doubt = np.ones(devices)
+        self._uncertainty = np.ones(devices)
         # Copies that were lost of the sample a device is repeating, and slots since it was taken.
         self._lost = np.zeros(devices, dtype=np.int64)
         self._behind = np.zeros(devices, dtype=np.int64)
@@ -113,33 +104,33 @@ class Uplink:
         self.reports = 0
 
     def begin(self) -> None:
-        """Start a slot: new fading."""
+        """Start a slot with new fading."""
         self._gain = next(self._fading)
 
     def weigh(self, apart: Floats) -> None:
-        """Take how far each controller's levels are apart [N]."""
+        """Take the disagreement of each controller's levels [N]."""
         if self._access.levels:
-            self._doubt = self._access.levels.doubt(self._age, apart)
+            self._uncertainty = self._access.levels.relative_growth(self._age, apart)
 
     def checking(self) -> Bools:
-        """Which devices compare the controller's force with their own in this slot [N].
+        """Choose the devices that compare the controller's force with their own now [N].
 
-        Those whose turn it is, who could report, and whose error may well be beyond δ.
+        It is their turn, they could report, and their error may well be beyond δ.
         """
         turn = (self._slot + np.arange(len(self._gain))) % CHECK_PERIOD == 0
         if not self._slot:
             return np.zeros_like(turn)
-        due = self._access.growth.at(self._age) * self._doubt >= self._delta**2
+        due = self._access.growth.at(self._age) * self._uncertainty >= self._delta**2
         return np.asarray(turn & self._able & due)
 
     def hear(self, devices: Bools, innovation: Floats) -> None:
-        """Take the innovations |C(z) − ũ| ÷ 40 N of ``devices``, of which some report."""
-        levels = 2**LEVEL_BITS
-        level = np.minimum(np.floor(innovation * levels), levels - 1)
-        known = self._reported[devices]
-        tells = (innovation >= self._delta) & ((level + 0.5) / levels >= REPORT_AGAIN * known)
-        who = np.flatnonzero(devices)[tells]
-        self._reported[who] = (level[tells] + 0.5) / levels
+        """Take the innovations |C(z) − ũ| ÷ the force range of ``devices``; some report."""
+        steps = 2**INNOVATION_BITS
+        sent = (np.minimum(np.floor(innovation * steps), steps - 1) + 0.5) / steps
+        reports = innovation >= self._delta
+        reports &= sent >= REPORT_AGAIN * self._reported[devices]
+        who = np.flatnonzero(devices)[reports]
+        self._reported[who] = sent[reports]
         self.reports += len(who)
         # The other devices look in other slots: this slot's reports are its share of all.
         excess = len(who) / self._access.blocks - REPORTS_PER_BLOCK
@@ -147,11 +138,11 @@ class Uplink:
         self._delta = min(max(steered, DELTA[0]), self._highest_delta)
 
     def grant(self) -> Bools:
-        """Hand out the blocks of this slot; returns whose packets arrive [N]. Ends the slot.
+        """Hand out the blocks of this slot and end it; return whose packets arrive [N].
 
-        At the very first slot everybody's does: loops start with a known state.
+        In the very first slot everybody's does: loops start with a known state.
         """
-        view = View(
+        view = SlotView(
             age=self._age,
             waited=self._waited,
             gain=self._gain,
@@ -159,14 +150,17 @@ class Uplink:
             queue=self._queue,
             reported=self._reported,
             growth=self._access.growth,
-            doubt=self._doubt,
+            uncertainty=self._uncertainty,
         )
         repeats = (self._lost > 0) & self._able  # a copy that waits is worth less every slot
         chosen = pick(np.where(repeats, np.inf, self._score(view)), self._access.blocks)
         sent = chosen & self._able if self._slot else np.ones_like(chosen)
         failed = self._errors.random(len(chosen)) < self._round_errors[self._lost]
         arrived = sent & ~failed if self._slot else sent
-        self._repeat(sent, arrived)
+        rounds = len(self._round_errors)
+        self.sampled = sent & (self._lost == 0) & (arrived | (rounds > 1))
+        copies = np.where(sent & ~arrived, self._lost + 1, self._lost)
+        self._lost = np.where(arrived | (copies == rounds), 0, copies)  # who will repeat a sample
         self._waited = np.where(chosen, 0, self._waited) + 1
         self._queue = np.maximum(self._queue - self._fair_age, 0.0) + self._age
         self._age = np.where(arrived, self._behind, self._age) + 1
@@ -175,23 +169,12 @@ class Uplink:
         self._slot += 1
         return arrived
 
-    def _repeat(self, sent: Bools, arrived: Bools) -> None:
-        """Take note of who sent a new sample, and of who will repeat one."""
-        rounds = len(self._round_errors)
-        self.sampled = sent & (self._lost == 0) & (arrived | (rounds > 1))
-        copies = np.where(sent & ~arrived, self._lost + 1, self._lost)
-        self._lost = np.where(arrived | (copies == rounds), 0, copies)
-
     @property
     def _power(self) -> Floats:
-        """Power that the target takes ÷ power limit [N]."""
+        """Return the power that the target takes ÷ the power limit [N]."""
         with np.errstate(divide="ignore"):
             return np.asarray(self._threshold / self._gain)
 
     @property
     def _able(self) -> Bools:
-        return np.asarray(self._gain >= self._threshold)
-
-
-def _each(value: ArrayLike, devices: int) -> Floats:
-    return np.broadcast_to(np.asarray(value, np.float64), devices)
+        return np.asarray(self._power <= 1.0)  # as schedulers see it: up to rounding, gain ≥ margin

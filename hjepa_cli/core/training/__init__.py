@@ -1,1 +1,1 @@
-"""How the networks are trained."""
+"""The networks are trained here."""

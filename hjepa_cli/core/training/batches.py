@@ -1,30 +1,30 @@
-"""Training batches: whole sub-sampled trajectories, so that one encoding of a frame serves as
-start, target and inverse-dynamics sample at once."""
+"""Training batches are whole sub-sampled trajectories: one encoding of a frame serves as start,
+target and inverse-dynamics sample at once."""
 
 import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.plants.frames import frames_seen
 
-Labels = Callable[[Tensor, Tensor, NDArray[np.int64]], Tensor]
-"""Trajectories [B, 1], steps k [B, F], shifts [B, 1] in px → the teacher's actions ÷ force limit
-[B, F, *A] in the states that the shifted pictures show."""
+Labels = Callable[[Tensor, Tensor, Integers], Tensor]
+"""It maps trajectories [B, 1], steps k [B, F] and shifts [B, 1] in px to the teacher's actions ÷
+force limit [B, F, *A] in the states that the shifted pictures show."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrajectoryBatch:
-    """B windows of F frames, ``stride`` control steps apart.
+    """A batch has B windows of F frames, ``stride`` control steps apart.
 
     Attributes:
         frames: uint8 [B · F, κ, H, W, 3], the current one last.
         actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
-        drawn: which windows were drawn, for messages.
-        labels: what the teacher would do there ÷ force limit [B · F, *A], if the windows have any.
+        drawn: the windows' names, for messages.
+        labels: the teacher's actions there ÷ force limit [B · F, *A], if the windows have any.
     """
 
     frames: Tensor
@@ -35,15 +35,15 @@ class TrajectoryBatch:
 
 def window_indices(
     length: int, frames: int, stride: int, generator: np.random.Generator, count: int
-) -> NDArray[np.int64]:
-    """Steps k of ``count`` random windows inside 0 … length − 1: int64 [count, frames]."""
+) -> Integers:
+    """Draw steps k [count, frames] of windows inside 0 … length − 1."""
     last_start = length - 1 - (frames - 1) * stride
     starts = generator.integers(0, last_start + 1, size=count)
     return starts[:, None] + stride * np.arange(frames)[None, :]
 
 
 def stride_actions(actions: Tensor, steps: Tensor, stride: int) -> Tensor:
-    """Actions of every stride: [B, T, *A] and frame steps [B, F] → [B, F − 1, stride, *A].
+    """Cut actions [B, T, *A] at frame steps [B, F] into strides [B, F − 1, stride, *A].
 
     Row f holds u_k … u_{k + stride − 1} for k = steps[f], the actions that lead from frame f to
     frame f + 1.
@@ -54,19 +54,17 @@ def stride_actions(actions: Tensor, steps: Tensor, stride: int) -> Tensor:
 
 
 class FrameWindows:
-    """Draws :class:`TrajectoryBatch` es from rendered trajectories.
+    """It draws :class:`TrajectoryBatch` es from rendered trajectories.
 
     Args:
         frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.
         actions: applied actions ÷ force limit [N, T, *A].
         window_frames, stride: F and the control steps between frames.
         mirror: flip half of the windows left to right and their actions with them, which is exact
-            physics and doubles the data.
+            physics and doubles the data; ``mirrored_actions`` are the factors of that.
         shift_px: move every window sideways by −shift_px … shift_px whole pixels, the same for all
-            its frames. Exact physics as well, as long as nothing leaves the picture: the same
-            motion elsewhere on the track.
-        mirrored_actions: what mirroring does to actions, a factor for each.
-        labels: what the teacher does in shifted pictures, where that is wanted.
+            its frames: exact physics as well, as long as nothing leaves the picture.
+        labels: the teacher in shifted pictures, where that is wanted.
         frames_each: κ, of which a device remembers no more than it has seen.
     """
 
@@ -93,7 +91,7 @@ class FrameWindows:
     def draw(
         self, count: int, generator: np.random.Generator, share: slice = slice(None)
     ) -> TrajectoryBatch:
-        """``count`` windows from trajectories drawn without replacement where they suffice.
+        """Draw ``count`` windows of trajectories, without replacement where they suffice.
 
         Of these the windows ``share`` are cut out: what is drawn does not depend on it.
         """
@@ -131,7 +129,7 @@ class FrameWindows:
 
 
 def shift_sideways(frames: Tensor, shift_px: int) -> Tensor:
-    """Frames [..., H, W, 3] moved right by ``shift_px`` (left: negative), edge columns repeated.
+    """Move frames [..., H, W, 3] right by ``shift_px`` (left: negative), repeating edge columns.
 
     The scene is the same all along the track, so this is what the camera would have seen.
     """

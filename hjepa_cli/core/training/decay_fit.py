@@ -1,4 +1,4 @@
-"""How a decaying hold is fitted: by the gap that it tolerates, on devices that no evaluation draws.
+"""A decaying hold is fitted by the gap that it tolerates, on devices that no evaluation draws.
 
 Gains and decay belong together. A law that is right with a packet at every step is too slow for
 sparse ones; a stiffer law whose force fades in time is a pulse that leaves a device at rest. So
@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.settings import ProtocolSettings
+from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats
-from hjepa_cli.core.control.controllers import Oracle
+from hjepa_cli.core.control.controllers import LastForce, Oracle
 from hjepa_cli.core.control.loop import STATE_LIMIT, Draws, Sensor, gap_schedule, simulate
-from hjepa_cli.core.control.reflex_controllers import DecayingHold
 from hjepa_cli.core.control.sensors import true_state
 from hjepa_cli.core.plants.linear import gains_at_rest
 from hjepa_cli.core.plants.system import System
@@ -29,25 +28,25 @@ AROUND = (0.5, 0.7, 0.85, 1.0, 1.15)  # of the oracle's tolerated gap: where can
 ELITE = 6  # one candidate in so many shapes the next round
 TIE = 0.1  # weight of the mean score beside the tolerated gap ÷ the longest that is tried
 Evaluate = Callable[[Floats], Floats]
-"""Candidates [C, P] → how good each is [C]."""
+"""It says how good each of candidates [C, P] is: [C]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """Closed loops that candidates are compared in, all on the same draws.
+    """Candidates are compared in these closed loops, all on the same draws.
 
     Attributes:
         kind: the nominal plant.
-        draws: of N devices.
-        gaps: between packets [G], in steps.
-        level: the acceptable score ÷ the teacher's.
+        draws: those of N devices.
+        gaps: steps between packets [G].
+        acceptable: the acceptable score ÷ the teacher's.
         teacher: the teacher's share of these steps in the band, with the true state at each step.
     """
 
     kind: System
     draws: Draws
     gaps: Floats
-    level: float
+    acceptable: float
     teacher: Floats
 
     @classmethod
@@ -56,39 +55,40 @@ class Trial:
     ) -> "Trial":
         """Draw devices, and find the gaps to try them at: around what the oracle tolerates.
 
-        Args:
-            kind: the plant.
-            protocol: starts, noise, level and grid; its devices all are nominal here.
-            devices: N.
-            steps: that are scored, after the warm-up of the protocol.
-            seed: of the settings.
+        The devices of the ``protocol`` all are nominal here, and ``steps`` are scored after its
+        warm-up.
         """
         nominal = dataclasses.replace(protocol, steps=steps, plant_spread=0.0)
         draws = Draws.make(nominal, devices, seed + SEARCH_SEED)
-        teacher = cls(kind, draws, np.ones(1), protocol.acceptable_score, np.ones(devices))
+        states = len(kind.state_names)
+
+        def shares(gaps: Floats) -> Floats:
+            loops = devices * len(gaps)
+            oracle = Oracle(kind.teacher(), kind.advance, kind.force_limit_n, loops, states=states)
+            trial = cls(kind, draws, gaps, protocol.acceptable_score, np.ones(devices))
+            return trial.shares(oracle, true_state)
+
         grid = np.array(protocol.gaps, float)
-        trial = dataclasses.replace(
-            teacher, gaps=grid, teacher=teacher.shares(_oracle(kind, devices), true_state)[0]
-        )
-        scores = ratio(trial.shares(_oracle(kind, devices * len(grid)), true_state), trial.teacher)
-        tolerated = float(first_crossing(grid, scores, trial.level, log=False))
+        (teacher,) = shares(np.ones(1))
+        scores = ratio(shares(grid), teacher)
+        tolerated = float(first_crossing(grid, scores, protocol.acceptable_score, log=False))
         tolerated = float(np.clip(tolerated, grid[min(1, len(grid) - 1)], grid[-1]))
         gaps = np.clip(np.array(AROUND) * tolerated, 1.0, steps)
-        return dataclasses.replace(trial, gaps=gaps)
+        return cls(kind, draws, gaps, protocol.acceptable_score, teacher)
 
     def first(self, devices: int) -> "Trial":
-        """The same with fewer devices, or as many as there are."""
+        """Return the same with fewer devices, or as many as there are."""
         part = slice(min(devices, self.draws.devices))
         return dataclasses.replace(self, draws=self.draws.part(part), teacher=self.teacher[part])
 
     @property
     def schedules(self) -> Bools:
-        """When packets arrive [G, steps, N]."""
+        """Return when packets arrive [G, steps, N]."""
         draws = self.draws
         return np.stack([gap_schedule(gap, draws.steps, draws.devices) for gap in self.gaps])
 
     def shares(self, controller: Any, sensor: Sensor, candidates: int = 1) -> Floats:
-        """Share of the scored steps in the band [C · G, N], candidate by candidate.
+        """Return the share of scored steps in the band [C · G, N], candidate by candidate.
 
         ``controller`` drives C · G · N devices.
         """
@@ -96,44 +96,32 @@ class Trial:
         return simulate(self.kind, self.draws, schedules, controller, sensor).score
 
     def quality(self, shares: Floats) -> Floats:
-        """How good candidates are [C], from :meth:`shares`.
+        """Say how good candidates are [C], from :meth:`shares`.
 
-        The tolerated gap ÷ the longest that is tried, and a little of the mean score, which still
-        tells where no gap is tolerated or all are.
+        It is the tolerated gap ÷ the longest that is tried, and a little of the mean score, which
+        still tells where no gap is tolerated or all are.
         """
         scores = ratio(shares, self.teacher).reshape(-1, len(self.gaps))
-        tolerated = first_crossing(self.gaps, scores, self.level, log=False)
+        tolerated = first_crossing(self.gaps, scores, self.acceptable, log=False)
         tolerated = np.clip(tolerated, 0.0, self.gaps[-1])
         return np.asarray(tolerated / self.gaps[-1] + TIE * scores.mean(axis=1))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Law:
-    """u = −K x at a packet, then e^(−j/τ) of it at age j.
+    """The force is u = −K x at a packet, then e^(−j/τ) of it at age j."""
 
-    Attributes:
-        gains_n: K [m, S], N per unit of state.
-        tau_steps: τ.
-    """
-
-    gains_n: Floats
-    tau_steps: float
+    gains_n: Floats  # K [m, S], N per unit of state
+    tau_steps: float  # τ
 
 
 def cross_entropy(
     evaluate: Evaluate, mean: Floats, spread: Floats, *, candidates: int, rounds: int, seed: int
 ) -> Floats:
-    """Search by drawing candidates from a normal distribution and moving it to the best of them.
+    """Return the mean [P] of the best candidates of the last round.
 
-    Args:
-        evaluate: what is maximised.
-        mean, spread: of the first round [P].
-        candidates: C of each round.
-        rounds: at least 1.
-        seed: of the draws.
-
-    Returns:
-        The mean [P] of the last round's best.
+    ``candidates`` are drawn from a normal distribution, which moves to the best of them, in each
+    round; ``mean`` and ``spread`` [P] are those of the first one.
     """
     random = generator(seed, SEARCH_KEY)
     for _ in range(rounds):
@@ -147,13 +135,10 @@ def cross_entropy(
 def search_law(
     trial: Trial, *, candidates: int, rounds: int, seed: int, tied: bool = False
 ) -> tuple[Law, float]:
-    """Find K and τ together, on the true state.
+    """Find K and τ together, on the true state; return the law and its factor.
 
     K is sought as factors of the teacher's own gains at rest, each gain with a factor of its own
-    or, ``tied``, one for all.
-
-    Returns:
-        The law, and the factor (``tied``; 1 otherwise, where it is in the gains).
+    or, ``tied``, one for all. Otherwise the factor is in the gains, and 1 is returned.
     """
     gains_n = gains_at_rest(trial.kind.teacher(), len(trial.kind.state_names))
     factors = 1 if tied else gains_n.size
@@ -177,9 +162,9 @@ def search_law(
 
 
 def shares_of_laws(trial: Trial, gains_n: Floats, tau_steps: Floats) -> Floats:
-    """As :meth:`Trial.shares`, for laws K [C, m, S] and τ [C] on the true state.
+    """Return :meth:`Trial.shares` of laws K [C, m, S] and τ [C] on the true state.
 
-    By the plant's exact equations, many candidates at once.
+    The plant's exact equations move many candidates at once.
     """
     kind, draws, schedules = trial.kind, trial.draws, trial.schedules
     count, shape = len(gains_n), (len(gains_n), len(trial.gaps), draws.devices)
@@ -212,25 +197,19 @@ def fit_decay(
     rounds: int,
     seed: int,
 ) -> tuple[float, float]:
-    """Find s and τ for an actor on what a sensor really sends.
-
-    Args:
-        trial: the loops.
-        actor: packets → forces_n.
-        sensor: of the device.
-        start: s and τ to start from.
-        candidates, rounds, seed: of the search.
-
-    Returns:
-        s and τ in steps.
-    """
+    """Return s and τ in steps for an actor on what a sensor really sends, from ``start`` on."""
     kind = trial.kind
     loops = len(trial.gaps) * trial.draws.devices
 
     def evaluate(candidate: Floats) -> Floats:
         gains, taus = np.repeat(np.exp(candidate), loops, axis=0).T
-        controller = DecayingHold(
-            actor, gains, taus, kind.force_limit_n, len(gains), action_shape=kind.action_shape
+        controller = LastForce(
+            actor,
+            len(gains),
+            gain=gains,
+            tau_steps=taus,
+            force_limit_n=kind.force_limit_n,
+            action_shape=kind.action_shape,
         )
         return trial.quality(trial.shares(controller, sensor, len(candidate)))
 
@@ -244,8 +223,3 @@ def fit_decay(
     )
     gain, tau_steps = np.exp(found)
     return float(gain), float(tau_steps)
-
-
-def _oracle(kind: System, devices: int) -> Oracle:
-    states = len(kind.state_names)
-    return Oracle(kind.teacher(), kind.advance, kind.force_limit_n, devices, states=states)

@@ -1,4 +1,4 @@
-"""Training the levels of the hierarchy on frozen embeddings: P^H and flat predictors by rollouts,
+"""The levels of the hierarchy learn on frozen embeddings: P^H and flat predictors by rollouts,
 P^M and P^L by filling the gaps between P^H's own predictions."""
 
 import dataclasses
@@ -15,24 +15,24 @@ from hjepa_cli.core.training.losses import cosine_loss, rollout_loss
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddedTrajectories:
-    """Frozen embeddings [N, T, D] of k = 0 … T − 1, applied actions ÷ force limit [N, T, *A]."""
+    """Frozen embeddings [N, T, D] go with the applied actions ÷ force limit [N, T, *A]."""
 
     z: Tensor
     actions: Tensor
 
     def first(self, count: int) -> "EmbeddedTrajectories":
-        """The first ``count`` trajectories."""
+        """Return the first ``count`` trajectories."""
         return EmbeddedTrajectories(self.z[:count], self.actions[:count])
 
     def choose(self, count: int, generator: np.random.Generator) -> Tensor:
-        """The trajectories [B] of a batch: the first that a loss below draws."""
+        """Draw the trajectories [B] of a batch: what a loss below draws first."""
         total = len(self.z)
         return torch.from_numpy(generator.choice(total, size=count, replace=count > total))
 
     def windows(
         self, count: int, frames: int, stride: int, generator: np.random.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Random windows of ``frames`` embeddings, ``stride`` steps apart.
+        """Draw windows of ``frames`` embeddings, ``stride`` steps apart.
 
         Returns:
             Trajectory indices [B, 1], steps k [B, F] and stride actions [B, F − 1, stride, *A].
@@ -42,7 +42,7 @@ class EmbeddedTrajectories:
         return chosen[:, None], k, stride_actions(self.actions[chosen], k, stride)
 
     def window_frames(self, stride: int) -> int:
-        """Frames of the longest window at ``stride``."""
+        """Count the frames of the longest window at ``stride``."""
         return (self.z.shape[1] - 1) // stride + 1
 
 
@@ -56,17 +56,13 @@ def flat_loss(
     starts: int,
     generator: np.random.Generator,
 ) -> Tensor:
-    """Rollout loss of a one-stride predictor on random windows (P^H, TS-JEPA of any depth).
+    """Return the cosine loss of rollouts in random windows (P^H, TS-JEPA of any depth).
 
     Args:
-        stride: control steps per call.
+        predictor: one that takes ``stride`` control steps per call.
         horizon_steps: K_p, in control steps.
         trajectories: windows drawn, as long as the trajectories allow.
         starts: rollouts started per window, at frames drawn without replacement.
-        generator: of windows and starts.
-
-    Returns:
-        Scalar cosine loss.
     """
     frames = data.window_frames(stride)
     rows, k, actions = data.windows(trajectories, frames, stride, generator)
@@ -87,7 +83,7 @@ def medium_loss(
     trajectories: int,
     generator: np.random.Generator,
 ) -> Tensor:
-    """Scalar cosine loss of P^M inside the gaps of P^H's own rollouts; see :func:`high_gaps`."""
+    """Return the cosine loss of P^M inside the gaps of P^H's own rollouts."""
     left, right, actions, steps = high_gaps(
         high, data, h, horizon_steps=horizon_steps, trajectories=trajectories, generator=generator
     )
@@ -108,7 +104,7 @@ def low_loss(
     trajectories: int,
     generator: np.random.Generator,
 ) -> Tensor:
-    """Scalar cosine loss of P^L inside the m-steps that P^M laid between P^H's anchors."""
+    """Return the cosine loss of P^L inside the m-steps that P^M laid between P^H's waypoints."""
     left, right, actions, steps = high_gaps(
         high, data, h, horizon_steps=horizon_steps, trajectories=trajectories, generator=generator
     )
@@ -136,15 +132,9 @@ def high_gaps(
     trajectories: int,
     generator: np.random.Generator,
 ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, Tensor]]:
-    """Roll P^H out from random starts and cut the rollouts into gaps.
+    """Roll P^H out from random starts over K_p steps and cut the rollouts into gaps of h steps.
 
-    Args:
-        high: P^H; no gradient reaches it.
-        data: embeddings [N, T, D] and actions [N, T, *A].
-        h: control steps per gap.
-        horizon_steps: K_p, length of the rollouts in control steps.
-        trajectories: rollouts.
-        generator: of trajectories and starts.
+    No gradient reaches P^H.
 
     Returns:
         Left and right ends [G, D] (z̃ at a and a + h), actions [G, h, *A] of steps a … a + h − 1,
@@ -153,11 +143,11 @@ def high_gaps(
     frames = min(max(horizon_steps // h, 1) + 1, data.window_frames(h))
     rows, k, actions = data.windows(trajectories, frames, h, generator)
     with torch.no_grad():
-        anchors = rollout(high, data.z[rows[:, 0], k[:, 0]], actions)
+        waypoints = rollout(high, data.z[rows[:, 0], k[:, 0]], actions)
     trajectory = rows.expand_as(k[:, :-1]).flatten()
     return (
-        anchors[:, :-1].flatten(0, 1),
-        anchors[:, 1:].flatten(0, 1),
+        waypoints[:, :-1].flatten(0, 1),
+        waypoints[:, 1:].flatten(0, 1),
         actions.flatten(0, 1),
         (trajectory, k[:, :-1].flatten()),
     )
@@ -166,12 +156,12 @@ def high_gaps(
 def interior(
     data: EmbeddedTrajectories, begin: tuple[Tensor, Tensor], gap: int, stride: int
 ) -> Tensor:
-    """True embeddings inside gaps, at a + stride, …, a + gap − stride: [G, C − 1, D]."""
+    """Return true embeddings inside gaps, at a + stride, …, a + gap − stride: [G, C − 1, D]."""
     rows, a = begin
     inside = a[:, None] + torch.arange(stride, gap, stride)
     return data.z[rows[:, None], inside]
 
 
 def split(actions: Tensor, stride: int) -> Tensor:
-    """Actions of gaps [G, steps, *A] → of their sub-strides [G, steps / stride, stride, *A]."""
+    """Cut actions of gaps [G, steps, *A] into sub-strides [G, steps / stride, stride, *A]."""
     return actions.reshape(len(actions), -1, stride, *actions.shape[2:])

@@ -1,4 +1,4 @@
-"""Training objectives, as pure functions of tensors."""
+"""Training minimises these losses of tensors."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ from hjepa_cli.core.networks.symmetry import (
 
 
 def cosine_loss(predicted: Tensor, target: Tensor) -> Tensor:
-    """1 − cos(z̃, sg(z)), averaged over all leading axes; inputs [..., D].
+    """Return 1 − cos(z̃, sg(z)), averaged over all leading axes; inputs [..., D].
 
     The paper prints arg min of the cosine itself (eq. 7), a sign slip.
     """
@@ -25,19 +25,18 @@ def cosine_loss(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def cosine_similarity(predicted: Tensor, target: Tensor) -> Tensor:
-    """cos(z̃, sg(z)) of embeddings [..., D] → [...]; no gradient reaches the target."""
+    """Return cos(z̃, sg(z)) [...] of embeddings [..., D]; no gradient reaches the target."""
     return F.cosine_similarity(predicted, target.detach(), dim=-1)
 
 
 def rollout_loss(
     predictor: Step, z: Tensor, targets: Tensor, actions: Tensor, starts: Tensor, horizon: int
 ) -> Tensor:
-    """Cosine loss of autoregressive rollouts from many starts, averaged over the rollout steps.
+    """Return the cosine loss of autoregressive rollouts from many starts.
 
     Args:
         predictor: one stride per call.
-        z: embeddings the rollouts start from [B, F, D], frames one stride apart.
-        targets: embeddings to reach [B, F, D].
+        z, targets: embeddings to start from and to reach [B, F, D], frames one stride apart.
         actions: [B, F − 1, steps, *A], ``actions[:, f]`` lead from frame f to f + 1.
         starts: ascending frame indices [S] to start from, the same for all B.
         horizon: strides to roll out; a start stops early where the window ends.
@@ -65,10 +64,10 @@ def rollout_loss(
 
 
 class InverseDynamics(nn.Module):
-    """Which action led from z_k to z_{k+h}? An auxiliary task that needs actions only, no state.
+    """Which action led from z_k to z_{k+h}? The auxiliary task needs actions only, no state.
 
     It makes the encoder keep what actions change, the velocities above all (ours; it turned the
-    recipe from useless to better than supervised, see docs/LOG.md). Used in training only.
+    recipe from useless to better than supervised, see docs/LOG.md). It is used in training only.
     """
 
     def __init__(
@@ -82,21 +81,16 @@ class InverseDynamics(nn.Module):
         super().__init__()
         linear: list[nn.Module] = [nn.Linear(2 * embedding, hidden), nn.Linear(hidden, forces)]
         if mirror is not None:
-            units = Twins(2 * hidden)
-            z = embedding_signs(embedding)
+            z, units = embedding_signs(embedding), Twins(2 * hidden)
             played = Signs(force_signs(mirror))
             linear = [MirrorLinear(Signs(z + z), units), MirrorLinear(units, played)]
         self.layers = nn.Sequential(linear[0], nn.ReLU(), linear[1])
 
     def loss(self, z: Tensor, z_next: Tensor, action: Tensor) -> Tensor:
-        """Mean squared error of the action, in units of half the force limit (10 N).
+        """Return the mean squared error of the action, in units of half the force limit.
 
-        Args:
-            z, z_next: embeddings [N, D] a stride apart.
-            action: [N, *A] mean applied action of the stride, in units of the force limit.
-
-        Returns:
-            Scalar in (half the force limit)².
+        Embeddings [N, D] are a stride apart; ``action`` [N, *A] is the stride's mean applied one,
+        in units of the force limit.
         """
         predicted = self.layers(torch.cat([z, z_next], dim=-1)).reshape(action.shape)
         return F.mse_loss(predicted, 2.0 * action)

@@ -1,4 +1,4 @@
-"""What all training loops share: device, precision, optimiser and its schedule."""
+"""All training loops share an optimiser with its schedule."""
 
 import functools
 import math
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor, nn
 
-from hjepa_cli.config.settings import ActorSettings
+from hjepa_cli.config.schema import ActorSettings
 from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.training.ranks import ALONE, Ranks
 from hjepa_cli.errors import NumericalError
@@ -18,7 +18,7 @@ MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
 
 
 def learning_rate_factor(step: int, steps: int, schedule: str) -> float:
-    """Learning rate at ``step`` of ``steps`` ÷ its peak: ``constant``, or ``one-cycle`` in cosines.
+    """Return the learning rate at ``step`` ÷ its peak: ``constant``, or ``one-cycle`` in cosines.
 
     A closed form of the step: there is no scheduler state to keep.
     """
@@ -31,13 +31,10 @@ def learning_rate_factor(step: int, steps: int, schedule: str) -> float:
 
 
 class Optimiser:
-    """AdamW or SGD with its schedule and gradient clipping; refuses non-finite losses.
+    """AdamW or SGD (``name`` is ``adamw`` or ``sgd``) refuses losses that are not finite.
 
     Args:
-        parameters: what to train.
-        name: ``adamw`` | ``sgd``.
-        schedule: see :func:`learning_rate_factor`.
-        steps: length of the schedule.
+        schedule, steps: see :func:`learning_rate_factor`.
         gradient_clip: largest gradient norm; 0 does not clip.
         ranks: the processes whose losses and gradients are summed.
     """
@@ -61,15 +58,9 @@ class Optimiser:
         self.gradient_clip, self.ranks = gradient_clip, ranks
 
     def step(self, loss: Tensor, step: int, batch: Callable[[], str] = lambda: "unnamed") -> float:
-        """One update at ``step``.
+        """Update at ``step`` by this process's part of a loss; return that of all processes.
 
-        Args:
-            loss: this process's part of it.
-            step: for the schedule and for messages.
-            batch: names what the loss was taken on, for messages.
-
-        Returns:
-            The loss of all processes.
+        ``batch`` names what the loss was taken on, for messages.
 
         Raises:
             NumericalError: the loss or its gradient is not finite.
@@ -94,7 +85,7 @@ class Optimiser:
         return total.item()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Its moments and step counts, flat: ``<parameter's number>.<name>``."""
+        """Return its moments and step counts, flat: ``<parameter's number>.<name>``."""
         return {
             f"{number}.{name}": value
             for number, parameter in enumerate(self.parameters)
@@ -122,7 +113,7 @@ class Optimiser:
 
 
 def name_samples(kind: str, indices: Tensor) -> str:
-    """``embeddings 3, 17, 4 …``: a batch in a message, its beginning if it is long."""
+    """Name a batch in a message, ``embeddings 3, 17, 4``: its beginning if it is long."""
     shown = ", ".join(str(index) for index in indices[:NAMED].tolist())
     return f"{kind} {shown}" + (f" and {len(indices) - NAMED} more" * (len(indices) > NAMED))
 
@@ -138,14 +129,9 @@ def fit_actor(
 ) -> Actor:
     """Fit the semantic actor on frozen embeddings by AdamW on the mean squared error.
 
-    Args:
-        z: embeddings [N, D].
-        actions: teacher's labels [N, *A] in units of the force limit.
-        epochs: passes over z, ``settings.epochs`` by default.
-        mirror: as for :class:`Actor`.
-
-    Returns:
-        The actor in evaluation mode, on the device of ``z``.
+    Embeddings [N, D] have the teacher's labels ``actions`` [N, *A] in units of the force limit;
+    ``epochs`` are ``settings.epochs`` by default. The actor comes back in evaluation mode, on the
+    device of ``z``.
     """
     torch.manual_seed(seed)
     actions = actions.to(z.device)

@@ -1,4 +1,4 @@
-"""One training on several processes, which ``torchrun`` starts.
+"""One training runs on several processes, which ``torchrun`` starts.
 
 Every process draws the same batch and takes its share of the windows. Gradients, losses and the
 statistics of batch norm are summed over all processes, so a step is that of one process with the
@@ -7,7 +7,6 @@ whole batch, whatever their number; only the order of the sums differs.
 
 import dataclasses
 import datetime
-import importlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,23 +24,18 @@ TIMEOUT = datetime.timedelta(minutes=30)
 
 @dataclasses.dataclass(frozen=True)
 class Ranks:
-    """The processes of a training, seen from one of them.
-
-    Attributes:
-        rank: number of this one.
-        size: how many there are.
-    """
+    """The processes of a training are seen from one of them, number ``rank`` of ``size``."""
 
     rank: int = 0
     size: int = 1
 
     @property
     def leads(self) -> bool:
-        """This one prints and writes."""
+        """Say whether this process prints and writes."""
         return self.rank == 0
 
     def share(self, count: int) -> slice:
-        """Which of ``count`` items are this process's; the shares differ by one at most."""
+        """Return which of ``count`` items are this process's; shares differ by one at most."""
         return slice(count * self.rank // self.size, count * (self.rank + 1) // self.size)
 
     def add_up(self, tensors: Sequence[Tensor]) -> None:
@@ -56,7 +50,7 @@ class Ranks:
                 tensor.copy_(part.view(tensor.shape))
 
     def gather(self, value: int) -> list[int]:
-        """The ``value`` of every process, by rank; all must ask."""
+        """Return the ``value`` of every process, by rank; all must ask."""
         if self.size == 1:
             return [value]
         values = torch.zeros(self.size, dtype=torch.int64)
@@ -67,7 +61,7 @@ class Ranks:
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """All processes pass this block, or none does.
+        """Let all processes pass this block, or none.
 
         Raises:
             HjepaError: this process's own error, or that another one has failed.
@@ -98,11 +92,9 @@ ALONE = Ranks()
 
 @contextmanager
 def joined(device: torch.device, items: int) -> Iterator[Ranks]:
-    """Meet the other processes of this ``torchrun``; alone without it.
+    """Meet the other processes of this ``torchrun``, to share a batch of ``items`` windows.
 
-    Args:
-        device: what to compute on; on GPUs, each process of a machine takes its own.
-        items: the windows of a batch, to be shared.
+    Without it a process is alone. On GPUs, each process of a machine takes its own.
 
     Raises:
         UsageError: more processes than windows, or than GPUs of this machine.
@@ -126,7 +118,8 @@ def joined(device: torch.device, items: int) -> Iterator[Ranks]:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     # The optimiser's first step imports this, and what it imports keeps the process group that it
     # finds. The group's threads then outlive it, and some ends of the interpreter abort on them.
-    importlib.import_module("torch._dynamo")
+    from torch import _dynamo  # noqa: F401
+
     # Counts and codes are exchanged on the CPU, whatever the device.
     backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
     dist.init_process_group(backend, timeout=TIMEOUT)
@@ -153,18 +146,16 @@ def all_reduce(tensor: Tensor) -> None:
 
 
 class Summed(torch.autograd.Function):
-    """The sum of a tensor over all processes, for losses that are summed over them too."""
+    """It sums a tensor over all processes, for losses that are summed over them too."""
 
     @staticmethod
     def forward(ctx: object, x: Tensor) -> Tensor:
-        total = x.clone()
-        all_reduce(total)
+        all_reduce(total := x.clone())
         return total
 
     @staticmethod
     def backward(ctx: object, *gradients: Tensor) -> Tensor:
-        total = gradients[0].clone()
-        all_reduce(total)
+        all_reduce(total := gradients[0].clone())
         return total
 
 

@@ -1,4 +1,4 @@
-"""What reflexes learn from: the teacher's plans, by the age of the packet that they start from."""
+"""Reflexes learn from the teacher's plans, by the age of the packet that they start from."""
 
 import dataclasses
 
@@ -14,12 +14,9 @@ from hjepa_cli.core.plants.system import System
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plans:
-    """What follows a packet, step by step.
+    """These forces ÷ force limit [N, L, *A] follow packets, at the ages 0 … L − 1.
 
-    Attributes:
-        teacher: the teacher's forces ÷ force limit [N, L, *A] at the ages 0 … L − 1.
-        sent: the forces ÷ force limit that were applied [N, L, *A]; the teacher's where there is
-            no exploration.
+    ``teacher`` are the teacher's, ``sent`` those that were applied: the same without exploration.
     """
 
     teacher: Tensor
@@ -68,39 +65,26 @@ def pushes(
     hold_steps: int,
     generator: np.random.Generator,
 ) -> Floats:
-    """Exploration as ``collect`` makes it: forces [count, steps, *A], constant for a while each."""
+    """Explore as ``collect`` does: return forces [count, steps, *A], constant for a while each."""
     held = -(-steps // hold_steps)
     drawn_n = generator.normal(0.0, exploration_n, (count, held, *kind.action_shape))
     return np.repeat(drawn_n, hold_steps, axis=1)[:, :steps]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Drawn:
-    """A batch: rows of packets [B], and ages [B, J] at which the forces of each are asked for."""
-
-    packets: Tensor
-    ages: Tensor
-
-
 def draw(
     network: Reflex, count: int, packets: int, ages: int, generator: np.random.Generator
-) -> Drawn:
-    """Random packets of ``count``, each at some random ages from 0 to the longest."""
+) -> tuple[Tensor, Tensor]:
+    """Return rows of random packets [B] of ``count``, and ages [B, J], from 0 to the longest."""
     rows = generator.integers(count, size=packets)
     drawn = generator.integers(network.longest_age + 1, size=(packets, ages))
-    return Drawn(torch.from_numpy(rows), torch.from_numpy(drawn))
+    return torch.from_numpy(rows), torch.from_numpy(drawn)
 
 
-def reflex_loss(network: Reflex, z: Tensor, plans: Plans, drawn: Drawn) -> Tensor:
-    """Mean squared error of the forces of a batch.
+def reflex_loss(network: Reflex, z: Tensor, plans: Plans, rows: Tensor, ages: Tensor) -> Tensor:
+    """Return the mean squared error of the forces of a batch, as :func:`draw` makes it.
 
-    Args:
-        network: what learns.
-        z: embeddings of all packets [N, D].
-        plans: what follows them, A + H steps at least.
-        drawn: the batch.
+    ``z`` are the embeddings of all packets [N, D]; ``plans`` follow them for A + H steps at least.
     """
-    rows, ages = drawn.packets, drawn.ages
     ahead = ages[..., None] + torch.arange(network.shape[0])
     labels = plans.teacher[rows[:, None, None], ahead]
     sent = None

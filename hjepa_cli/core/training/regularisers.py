@@ -1,7 +1,7 @@
-"""Terms that keep embeddings from collapsing, as alternatives to what the recipe relies on.
+"""These terms keep embeddings from collapsing, each looking at a batch as a whole, in float32.
 
 The default recipe needs none: inverse dynamics and long rollouts keep the embeddings apart. They
-are here to be compared with it. Both look at a batch as a whole, in float32.
+are here to be compared with it.
 """
 
 from collections.abc import Callable
@@ -18,14 +18,10 @@ FREQUENCIES = torch.linspace(-5.0, 5.0, 17)
 
 
 def vicreg(z: Tensor) -> Tensor:
-    """Variance and covariance terms of VICReg (Bardes et al. 2022, eqs. 1-4).
+    """Return the variance and covariance terms of VICReg (Bardes et al. 2022, eqs. 1-4).
 
-    Args:
-        z: embeddings [N, D].
-
-    Returns:
-        Scalar: how far standard deviations lie below 1, on average, plus the sum of squared
-        covariances between different values ÷ D.
+    For embeddings [N, D] they are how far standard deviations lie below 1, on average, plus the
+    sum of squared covariances between different values ÷ D.
     """
     with torch.autocast(z.device.type, enabled=False):
         centred = z.float() - z.float().mean(0)
@@ -37,17 +33,11 @@ def vicreg(z: Tensor) -> Tensor:
 
 
 def sigreg(z: Tensor, directions: Tensor) -> Tensor:
-    """Sketched isotropic Gaussian regularisation (Balestriero and LeCun 2025, LeJEPA).
+    """Return the sketched isotropic Gaussian regulariser (Balestriero and LeCun 2025, LeJEPA).
 
-    The Epps-Pulley distance between the distribution of z along random directions and a standard
-    normal one: ∫ |φ_N(t) − exp(−t²/2)|² exp(−t²/2) dt, without the usual factor N.
-
-    Args:
-        z: embeddings [N, D].
-        directions: unit vectors [D, M] to look along.
-
-    Returns:
-        Scalar: the mean over directions.
+    The Epps-Pulley distance between the distribution of z [N, D] along a direction and a standard
+    normal one, ∫ |φ_N(t) − exp(−t²/2)|² exp(−t²/2) dt without the usual factor N, is averaged over
+    ``directions``, unit vectors [D, M].
     """
     with torch.autocast(z.device.type, enabled=False):
         t = FREQUENCIES.to(z.device)
@@ -61,13 +51,10 @@ def sigreg(z: Tensor, directions: Tensor) -> Tensor:
 
 
 class Sigreg(nn.Module):
-    """:func:`sigreg` along other random directions at every call.
+    """:func:`sigreg` looks along other random directions at every call.
 
     They come from a stream of its own, since the probes that watch a training seed torch's again.
     Its state is a buffer: a saved training goes on with the directions that it would have had.
-
-    Args:
-        seed: of the training.
     """
 
     state: Tensor
@@ -85,9 +72,9 @@ class Sigreg(nn.Module):
 
 
 Regulariser = Callable[[Tensor], Tensor]
-"""Embeddings [N, D] to a scalar."""
+"""It maps embeddings [N, D] to a scalar."""
 
-# Each made for the seed of a training.
+# Each is made for the seed of a training.
 REGULARISERS: dict[str, Callable[[int], Regulariser]] = {
     "vicreg": lambda seed: vicreg,
     "sigreg": Sigreg,

@@ -1,6 +1,6 @@
-"""Batch norm whose batch is spread over several processes.
+"""Batch norm works on a batch that is spread over several processes.
 
-torch has it for GPUs only (``SyncBatchNorm`` refuses CPU tensors).
+torch's own does so on GPUs only (``SyncBatchNorm`` refuses CPU tensors).
 """
 
 import torch
@@ -12,7 +12,7 @@ from hjepa_cli.core.training.ranks import summed
 
 
 class SharedBatchNorm(_BatchNorm):
-    """:class:`torch.nn.BatchNorm1d` and ``2d`` over the batches of all processes together."""
+    """:class:`torch.nn.BatchNorm1d` and ``2d`` take the batches of all processes together."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise [N, C, …] per channel; the same as batch norm of all N of all processes."""
@@ -22,33 +22,29 @@ class SharedBatchNorm(_BatchNorm):
         axes = [axis for axis in range(x.dim()) if axis != 1]
         shape = [1, -1, *[1] * (x.dim() - 2)]
         mean, variance, unbiased = _moments(values, axes)
-        self._remember(mean, unbiased)
+        assert self.momentum is not None and self.num_batches_tracked is not None
+        assert self.running_mean is not None and self.running_var is not None
+        with torch.no_grad():
+            self.running_mean.lerp_(mean, self.momentum)
+            self.running_var.lerp_(unbiased, self.momentum)
+            self.num_batches_tracked += 1
         y = (values - mean.view(shape)) * (variance + self.eps).rsqrt().view(shape)
         if self.affine:
             y = y * self.weight.view(shape) + self.bias.view(shape)
         return y.to(x.dtype)
 
     def _check_input_dim(self, x: Tensor) -> None:
-        """Both dimensions are served."""
-
-    @torch.no_grad()
-    def _remember(self, mean: Tensor, variance: Tensor) -> None:
-        """Move the running statistics."""
-        assert self.momentum is not None and self.num_batches_tracked is not None
-        assert self.running_mean is not None and self.running_var is not None
-        self.running_mean.lerp_(mean, self.momentum)
-        self.running_var.lerp_(variance, self.momentum)
-        self.num_batches_tracked += 1
+        """Accept both dimensions."""
 
 
 class SharedTwinNorm(TwinsAsOne, SharedBatchNorm):
-    """The same for twins, see :class:`~hjepa_cli.core.networks.symmetry.MirrorNorm2d`."""
+    """It does the same for twins, as :class:`~hjepa_cli.core.networks.symmetry.MirrorNorm2d`."""
 
 
 def _moments(values: Tensor, axes: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, variance and unbiased variance [C] over all processes, in one message.
+    """Return mean, variance and unbiased variance [C] over all processes, in one message.
 
-    In float64, because the second moment is large beside what is left of it.
+    They are computed in float64: the second moment is large beside what is left of it.
     """
     variance, mean = torch.var_mean(values, axes, correction=0)
     mean, variance = mean.double(), variance.double()

@@ -1,1 +1,1 @@
-"""The cart-poles."""
+"""The cart-poles have a simulation, a teacher and a camera of their own."""

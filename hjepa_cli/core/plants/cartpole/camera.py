@@ -1,4 +1,4 @@
-"""The camera: exactly anti-aliased pictures of a cart-pole, straight from its state.
+"""The camera draws exactly anti-aliased pictures of a cart-pole, straight from its state.
 
 The colour of a pixel is that of the scene averaged over the pixel's square, so a pole tip that
 moves by a hundredth of a pixel (1 ms of motion) changes the picture. All coverages are areas in
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hjepa_cli.core.arrays import Floats, Integers
+from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels, finite
 from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
 
@@ -35,7 +35,7 @@ POLE_RGB = (160, 0, 0)
 _CHUNK = 32  # frames drawn together: few calls, and the work stays in the cache
 _SUBPIXELS = 2.0**20
 _UPRIGHT_PX = 2.0**-17  # an edge that leans less inside a pixel row is spread over this much
-_LEVEL_PX = 1e-12  # an edge that rises less bounds no area
+_RISE_PX = 1e-12  # an edge that rises less bounds no area
 _PIXEL = np.dtype("V3")  # one RGB pixel, copied as a whole
 
 # The pole's corners in order around it: the side of its axis, and the end (pivot 0, tip 1).
@@ -44,10 +44,9 @@ _CORNER_ENDS = np.array([0.0, 1.0, 1.0, 0.0])
 
 
 class Camera:
-    """A fixed camera in front of the track; x = 0 is in the middle of the picture.
+    """The camera stands in front of the track; x = 0 is in the middle of the picture.
 
-    Args:
-        parameters: fix the window and the sizes of cart and pole.
+    ``parameters`` fix the window and the sizes of cart and pole.
     """
 
     def __init__(self, parameters: CartPoleParameters) -> None:
@@ -60,16 +59,16 @@ class Camera:
         self._lines = math.ceil(math.hypot(2 * self._side_px, self._length_px)) + 1
         self._across = math.ceil(2 * self._side_px * math.sqrt(2) + 1) + 1
 
-    def render(self, states: ArrayLike) -> NDArray[np.uint8]:
-        """Return one RGB frame per state.
+    def render(self, states: ArrayLike) -> Pixels:
+        """Return RGB frames uint8 ``[n, 64, 128, 3]``, cut off at the edges of the window.
 
         Args:
             states: ``[n, 4]`` x [m], x_dot, theta [rad], theta_dot; the velocities are not seen.
 
-        Returns:
-            ``[n, 64, 128, 3]`` uint8. What lies outside of the window is cut off.
+        Raises:
+            NumericalError: a state is not finite.
         """
-        states = np.asarray(states, float)
+        states = finite(states, "states")
         count = len(states)
         # One pixel more than the frames have: whatever is cut off is drawn there.
         pixels = np.empty(count * HEIGHT_PX * WIDTH_PX + 1, _PIXEL)
@@ -95,8 +94,8 @@ class Camera:
         }
 
     def sketch_px(self, state: ArrayLike) -> list[Floats]:
-        """The pole's axis and the cart's outline of a state ``[4]``, in pixels (column, row)."""
-        x_m, _, theta, _ = np.asarray(state, float)
+        """Return the pole's axis and the cart's outline of a state ``[4]``, (column, row) in px."""
+        x_m, _, theta, _ = finite(state, "state")
         pivot = np.array([WIDTH_PX / 2 + x_m * self.scale_px_m, PIVOT_ROW_PX])
         length_px = 2 * self.plant.half_length_m * self.scale_px_m
         tip = pivot + length_px * np.array([np.sin(theta), -np.cos(theta)])
@@ -117,10 +116,10 @@ class Camera:
         reach_x, reach_y = (math.ceil(half) for half in self._cart_px)
         rows = np.arange(-reach_y, reach_y)
         columns = np.arange(-reach_x, reach_x + 1)
-        level = np.ones(len(states), bool)
-        cart = self._cart(level, pivot_px)
+        unturned = np.ones(len(states), bool)
+        cart = self._cart(unturned, pivot_px)
         covered = cart.cover(rows[None], columns[None, None])
-        canvas.paint(level, rows[None], columns[None, None], covered, np.zeros(1))
+        canvas.paint(unturned, rows[None], columns[None, None], covered, np.zeros(1))
 
         pole = self._pole(np.abs(theta), pivot_px)
         cart = self._cart(pole.upright, pivot_px)
@@ -133,7 +132,7 @@ class Camera:
         hidden[cut] = _inside(cart, pole, frame, lines[frame, line], band[frame, line, across])
         canvas.paint(pole.upright, lines, band, under - hidden, over)
 
-    def _cart(self, upright: NDArray[np.bool_], pivot_px: Floats) -> "_Box":
+    def _cart(self, upright: Bools, pivot_px: Floats) -> "_Box":
         half_width, half_height = self._cart_px
         pivot_a, pivot_b = _swap(upright, np.zeros(len(pivot_px)), pivot_px)
         half_a, half_b = _swap(upright, np.asarray(half_height), np.asarray(half_width))
@@ -157,13 +156,13 @@ class Camera:
 
 
 # Below, a frame is seen with its pole upright or nearly so: a runs along the image axis that is
-# nearer to the pole's, b along the other one. For level poles that swaps rows and columns.
+# nearer to the pole's, b along the other one. For lying poles that swaps rows and columns.
 # Coordinates are in pixels from the corner of the pivot's pixel; pixel i spans i … i + 1.
 
 
 @dataclasses.dataclass(frozen=True)
 class _Box:
-    """The cart of each frame: ``[n]`` ends along a and along b."""
+    """The cart of each frame ends at ``[n]`` along a and along b."""
 
     a_low: Floats
     a_high: Floats
@@ -179,9 +178,9 @@ class _Box:
 
 @dataclasses.dataclass(frozen=True)
 class _Pole:
-    """The pole of each frame: corners ``[n, 4]``, and its axis b = middle + slope · a ``[n]``."""
+    """The pole of each frame has corners ``[n, 4]`` and the axis b = middle + slope · a ``[n]``."""
 
-    upright: NDArray[np.bool_]
+    upright: Bools
     a: Floats
     b: Floats
     middle: Floats
@@ -196,21 +195,17 @@ class _Pole:
         return a.astype(np.int64), b.astype(np.int64)[..., None] + np.arange(across)
 
     def area(self, a_low: ArrayLike, a_high: ArrayLike, b_bounds: ArrayLike) -> Floats:
-        """Return its area inside cells.
+        """Return its area ``[n, A, B]`` [px²] inside cells.
 
-        Args:
-            a_low, a_high: ``[n, A]`` ends of rows of cells.
-            b_bounds: ``[n, A, B + 1]`` where the cells of a row begin and end.
-
-        Returns:
-            ``[n, A, B]`` px². An edge from b₀ to b₁ over da has the area da · mean(clip(b − c, 0,
-            width)) between itself and a cell's far side; around the pole these add up to its own.
-            The mean is a difference of ½ max(b − c, 0)² at the edge's ends and the cell's.
+        Rows of cells lie between ``a_low`` and ``a_high`` ``[n, A]``, cells between ``b_bounds``
+        ``[n, A, B + 1]``. An edge from b₀ to b₁ over da has the area da · mean(clip(b − c, 0,
+        width)) between itself and a cell's far side; around the pole these add up to its own.
+        The mean is a difference of ½ max(b − c, 0)² at the edge's ends and the cell's.
         """
         a0, b0 = self.a[:, :, None], self.b[:, :, None]
         a1, b1 = np.roll(self.a, -1, axis=1)[:, :, None], np.roll(self.b, -1, axis=1)[:, :, None]
         rise = a1 - a0
-        lean = (b1 - b0) / np.where(np.abs(rise) < _LEVEL_PX, np.inf, rise)
+        lean = (b1 - b0) / np.where(np.abs(rise) < _RISE_PX, np.inf, rise)
         first, last = np.minimum(a0, a1), np.maximum(a0, a1)
         start = np.minimum(np.maximum(np.asarray(a_low)[:, None], first), last)
         stop = np.minimum(np.maximum(np.asarray(a_high)[:, None], first), last)
@@ -234,43 +229,33 @@ class _Pole:
             total += far
         return np.abs(total[..., :-1] - total[..., 1:])
 
-    def of(self, frames: Integers) -> "_Pole":
-        """Return the poles of some of the frames."""
-        fields = (field.name for field in dataclasses.fields(self))
-        return _Pole(**{name: getattr(self, name)[frames] for name in fields})
-
 
 def _inside(cart: _Box, pole: _Pole, frames: Integers, a: Integers, b: Integers) -> Floats:
     """Return the area of the pole inside the cart inside single pixels (a, b), all ``[m]``."""
     a_low, a_high = np.maximum(a, cart.a_low[frames]), np.minimum(a + 1, cart.a_high[frames])
     b_low, b_high = np.maximum(b, cart.b_low[frames]), np.minimum(b + 1, cart.b_high[frames])
     bounds = np.stack([b_low, b_high], axis=-1)[:, None]
-    return pole.of(frames).area(a_low[:, None], a_high[:, None], bounds)[:, 0, 0]
+    fields = (field.name for field in dataclasses.fields(pole))
+    cut = _Pole(**{name: getattr(pole, name)[frames] for name in fields})
+    return cut.area(a_low[:, None], a_high[:, None], bounds)[:, 0, 0]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Canvas:
-    """Where a chunk of frames is drawn; ``columns`` ``[n]`` hold the pivots before mirroring."""
+    """A chunk of frames is drawn here; ``columns`` ``[n]`` hold the pivots before mirroring."""
 
     pixels: NDArray[Any]
     first: int
     columns: Integers
-    mirrored: NDArray[np.bool_]
+    mirrored: Bools
 
     def paint(
-        self,
-        upright: NDArray[np.bool_],
-        lines: Integers,
-        band: Integers,
-        cart: Floats,
-        pole: Floats,
+        self, upright: Bools, lines: Integers, band: Integers, cart: Floats, pole: Floats
     ) -> None:
         """Write the pixels at a = lines ``[n, A]``, b = band ``[n, A, B]``.
 
-        Args:
-            upright: ``[n]`` whether a counts rows (else columns).
-            lines, band: the pixels.
-            cart, pole: shares of each pixel that show cart and pole.
+        Where ``upright`` ``[n]``, a counts rows, else columns; ``cart`` and ``pole`` are the shares
+        of each pixel that show them.
         """
         colours = np.empty((*cart.shape, 3), np.uint8)
         for channel, (ground, of_cart, of_pole) in enumerate(
@@ -280,8 +265,8 @@ class _Canvas:
             colours[..., channel] = np.rint(colour)
         self.pixels[self._places(upright, lines, band)] = colours.view(_PIXEL)[..., 0]
 
-    def _places(self, upright: NDArray[np.bool_], lines: Integers, band: Integers) -> Integers:
-        """Index ``[n, A, B]`` into ``pixels``; the last pixel stands for all that is cut off."""
+    def _places(self, upright: Bools, lines: Integers, band: Integers) -> Integers:
+        """Return indices ``[n, A, B]`` into ``pixels``; the last stands for all that is cut off."""
         towards = np.where(self.mirrored, -1, 1)
         column = np.where(self.mirrored, WIDTH_PX - 1 - self.columns, self.columns)
         row = np.full(len(column), PIVOT_ROW_PX)
@@ -306,7 +291,7 @@ def _overlap(pixel: Integers, low: Floats, high: Floats) -> Floats:
     return np.maximum(overlap, 0.0)
 
 
-def _swap(condition: NDArray[np.bool_], first: Any, second: Any) -> tuple[Any, Any]:
+def _swap(condition: Bools, first: Any, second: Any) -> tuple[Any, Any]:
     """Return (first, second) where ``condition`` holds, else (second, first)."""
     return np.where(condition, first, second), np.where(condition, second, first)
 

@@ -1,4 +1,4 @@
-"""The cart-poles as plants: ``desktop``, the paper's at 1 ms, and ``gym``, Gymnasium's at 20 ms."""
+"""Cart-poles are plants: ``desktop``, the paper's at 1 ms, and ``gym``, Gymnasium's at 20 ms."""
 
 import dataclasses
 from typing import TYPE_CHECKING, ClassVar
@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, finite
 from hjepa_cli.core.plants.cartpole.camera import Camera
-from hjepa_cli.core.plants.cartpole.dynamics import rk4_step
 from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
 from hjepa_cli.core.plants.cartpole.teacher import sdre
 from hjepa_cli.core.plants.cost import stage_cost
 from hjepa_cli.core.plants.frames import WIDTH_PX
-from hjepa_cli.core.plants.system import System, Teacher
+from hjepa_cli.core.plants.system import System, Teacher, runge_kutta_step
 
 if TYPE_CHECKING:
     from hjepa_cli.core.plants.cartpole.simulation import CartPoles
@@ -24,45 +23,47 @@ SCORE_THETA_RAD = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class CartPolePlant(CartPoleParameters, System):
-    """A kind of cart-pole with all that surrounds it."""
+    """A kind of cart-pole is its numbers with all that surrounds them."""
 
     state_names: ClassVar[tuple[str, ...]] = ("x", "x_dot", "theta", "theta_dot")
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "rad", "rad/s")
 
     def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> "CartPoles":
-        """See :class:`hjepa_cli.core.plants.cartpole.simulation.CartPoles`."""
+        """Simulate by pymunk; ``mass_scale`` is of cart and pole."""
         from hjepa_cli.core.plants.cartpole.simulation import CartPoles  # pymunk, when it is needed
 
         return CartPoles(self, devices, mass_scale=mass_scale)
 
     def in_band(self, states: Floats) -> Bools:
-        """|x| ≤ 0.05 m and |θ| ≤ 0.05 rad. States [..., 4] → bool [...]."""
+        """Say whether |x| ≤ 0.05 m and |θ| ≤ 0.05 rad."""
         return (np.abs(states[..., 0]) <= SCORE_X_M) & (np.abs(states[..., 2]) <= SCORE_THETA_RAD)
 
     def cost(self, states: Floats, forces_n: Floats) -> Floats:
-        """See :func:`hjepa_cli.core.plants.cost.stage_cost`, with the teacher's weights."""
+        """Return the capped quadratic cost with the teacher's weights."""
         return stage_cost(states, forces_n, self.state_weights, self.force_weight)
 
     def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
-        """The track looks the same everywhere: only x moves."""
+        """Move x only: the track looks the same everywhere."""
         moved = np.array(states, float)
         moved[..., 0] += np.asarray(shift_px) * self.window_m[0] / WIDTH_PX
         return moved
 
     def advance(self, states: Floats, forces_n: Floats) -> Floats:
-        """See :func:`hjepa_cli.core.plants.cartpole.dynamics.rk4_step`."""
-        return rk4_step(self, states, forces_n, self.step_s)
+        """Take one Runge-Kutta step."""
+        held_n = finite(forces_n, "forces_n")
+        states = finite(states, "states")
+        return runge_kutta_step(lambda at: self.derivative(at, held_n), states, self.step_s)
 
     def teacher(self) -> Teacher:
-        """See :func:`hjepa_cli.core.plants.cartpole.teacher.sdre`."""
+        """Return the saturated state-dependent Riccati controller."""
         return sdre(self)
 
     def camera(self) -> Camera:
-        """See :class:`hjepa_cli.core.plants.cartpole.camera.Camera`."""
+        """Return its camera."""
         return Camera(self)
 
     def with_pole_length(self, scale: float) -> "CartPolePlant":
-        """The same with a pole ``scale`` times as long."""
+        """Return the same with a pole ``scale`` times as long."""
         return dataclasses.replace(self, half_length_m=scale * self.half_length_m)
 
 

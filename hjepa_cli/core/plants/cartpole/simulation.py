@@ -1,4 +1,4 @@
-"""Cart-poles simulated by pymunk.
+"""Pymunk simulates cart-poles.
 
 A cart slides on a groove; a uniform rod hangs on it by a pivot. A state is
 ``(x, x_dot, theta, theta_dot)`` in m, m/s, rad, rad/s; theta = 0 is upright, a positive theta
@@ -17,9 +17,9 @@ import pymunk
 import pymunk.batch
 from numpy.typing import ArrayLike
 
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.arrays import Floats, finite
 from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
-from hjepa_cli.core.plants.system import check_masses
+from hjepa_cli.core.plants.system import check_masses, check_states
 
 TRACK_M = 1e4  # half length of the groove: out of reach
 
@@ -35,7 +35,7 @@ _CART, _POLE = range(2)
 
 
 class _Writer:
-    """Writes ``[devices, 2, fields]`` (carts and poles) into a Space."""
+    """It writes ``[devices, 2, fields]`` (carts and poles) into a Space."""
 
     def __init__(self, devices: int, fields: pymunk.batch.BodyFields, width: int) -> None:
         # pymunk visits the Space's own static body too, after all the others.
@@ -50,7 +50,7 @@ class _Writer:
 
 
 class CartPoles:
-    """Many cart-poles of one kind in one pymunk Space.
+    """It holds cart-poles of one kind in one pymunk Space.
 
     Args:
         parameters: their numbers.
@@ -59,6 +59,7 @@ class CartPoles:
 
     Raises:
         UsageError: no devices, or mass factors that are not positive.
+        NumericalError: states are set, or forces applied, that are not finite.
     """
 
     def __init__(
@@ -98,7 +99,7 @@ class CartPoles:
 
     @property
     def states(self) -> Floats:
-        """The states ``[devices, 4]``: x [m], x_dot [m/s], theta [rad], theta_dot [rad/s]."""
+        """Return states ``[devices, 4]``: x [m], x_dot [m/s], theta [rad], theta_dot [rad/s]."""
         self._reading.clear()
         pymunk.batch.get_space_bodies(self._space, _MOTION, self._reading)
         bodies = np.frombuffer(self._reading.float_buf())[: 12 * self.devices].reshape(-1, 2, 6)
@@ -112,11 +113,8 @@ class CartPoles:
 
     @states.setter
     def states(self, states: ArrayLike) -> None:
-        states = np.asarray(states, float)
-        if states.shape != (self.devices, 4):
-            raise ValueError(f"states have shape {states.shape}, not ({self.devices}, 4)")
         length_m = self.plant.half_length_m
-        x, x_dot, theta, theta_dot = states.T
+        x, x_dot, theta, theta_dot = check_states(states, (self.devices, 4)).T
         x_before = x - x_dot * (self._substep_s / 2)
         theta_before = theta - theta_dot * (self._substep_s / 2)
         cart, pole = self._motion.bodies[:, _CART], self._motion.bodies[:, _POLE]
@@ -133,13 +131,10 @@ class CartPoles:
         self._motion.write(self._space)
 
     def step(self, forces_n: ArrayLike) -> None:
-        """Advance by one control step of ``plant.step_s``, without noise.
-
-        Args:
-            forces_n: force on each cart [N], ``[devices]``, clipped to ± ``plant.force_limit_n``.
-        """
+        """Advance by one control step under forces ``[devices]``, clipped; without noise."""
         limit_n = self.plant.force_limit_n
-        self._force.bodies[:, _CART, 0] = np.clip(forces_n, -limit_n, limit_n)
+        applied_n = np.clip(finite(forces_n, "forces_n"), -limit_n, limit_n)
+        self._force.bodies[:, _CART, 0] = applied_n
         for _ in range(self.plant.substeps):  # pymunk clears the forces after each
             self._force.write(self._space)
             self._space.step(self._substep_s)

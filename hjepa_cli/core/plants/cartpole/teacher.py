@@ -1,4 +1,4 @@
-"""The teacher: a saturated state-dependent Riccati controller (SDRE), tabulated.
+"""The teacher is a saturated state-dependent Riccati controller (SDRE), tabulated.
 
 The equations of motion factor exactly into ẋ = A(θ, θ̇) x + B(θ) u. At every state the linear
 quadratic problem of that A and B is solved and u = −K(θ, θ̇) x is applied, clipped to the force
@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.arrays import Floats, finite
 from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
 from hjepa_cli.core.plants.system import Teacher
 
@@ -21,15 +21,9 @@ CELLS = (96, 100)  # of the gain table over theta and theta_dot; even, so that 0
 
 
 def gains(plant: CartPoleParameters, theta: Floats, theta_dot: Floats) -> Floats:
-    """Solve the Riccati equation at every state.
+    """Return the gains K ``[n, 4]`` of u = −K x at theta ``[n]`` [rad], theta_dot ``[n]`` [rad/s].
 
-    Args:
-        plant: the plant; ``discrete_teacher`` selects the discrete equation at ``step_s``.
-        theta: ``[n]`` in rad.
-        theta_dot: ``[n]`` in rad/s.
-
-    Returns:
-        ``[n, 4]`` gains K for u = −K x.
+    ``plant.discrete_teacher`` selects the discrete Riccati equation at ``step_s``.
     """
     a, b = state_dependent_form(plant, theta, theta_dot)
     q, r = np.diag(plant.state_weights), plant.force_weight
@@ -61,17 +55,18 @@ def state_dependent_form(
 
 @functools.cache
 def sdre(plant: CartPoleParameters) -> Teacher:
-    """The teacher of a cart-pole: states ``[..., 4]`` → forces ``[...]`` in N.
+    """Return the teacher of a cart-pole, a function from states ``[..., 4]`` to forces_n ``[...]``.
 
-    Beyond the table (|θ| > 1.2 rad, |θ̇| > 25 rad/s) the gains of its edge are used.
+    Beyond the table (|θ| > 1.2 rad, |θ̇| > 25 rad/s) the gains of its edge are used. It raises
+    NumericalError where a state is not finite.
     """
-    cells = _bilinear_cells(_gain_table(plant))
+    cells = _bilinear_cells(plant)
     limits = np.array([THETA_LIMIT_RAD, THETA_DOT_LIMIT_RAD_S])
     per_cell = np.array(CELLS) / (2 * limits)
     last = np.array(CELLS) - 1
 
     def force_n(states: ArrayLike) -> Floats:
-        states = np.asarray(states, float)
+        states = finite(states, "states")
         flat = states.reshape(-1, 4)
         place = (np.clip(flat[:, 2:], -limits, limits) + limits) * per_cell
         cell = np.minimum(place.astype(np.intp), last)
@@ -85,17 +80,16 @@ def sdre(plant: CartPoleParameters) -> Teacher:
     return force_n
 
 
-def _gain_table(plant: CartPoleParameters) -> Floats:
-    """Return gains ``[theta, theta_dot, 4]`` on the grid; K(−θ, −θ̇) = K(θ, θ̇) halves the work."""
+def _bilinear_cells(plant: CartPoleParameters) -> Floats:
+    """Return per cell the coefficients ``[cells, 4, 4]`` of 1, s, t and s t, s and t in 0 … 1.
+
+    The gains on the grid are K(−θ, −θ̇) = K(θ, θ̇), which halves the work.
+    """
     theta = np.linspace(0.0, THETA_LIMIT_RAD, CELLS[0] // 2 + 1)
     theta_dot = np.linspace(-THETA_DOT_LIMIT_RAD_S, THETA_DOT_LIMIT_RAD_S, CELLS[1] + 1)
     grid = [axis.ravel() for axis in np.meshgrid(theta, theta_dot, indexing="ij")]
     half = gains(plant, *grid).reshape(theta.size, theta_dot.size, 4)
-    return np.concatenate([half[:0:-1, ::-1], half])
-
-
-def _bilinear_cells(table: Floats) -> Floats:
-    """Return per cell the coefficients ``[cells, 4, 4]`` of 1, s, t and s t, s and t in 0 … 1."""
+    table = np.concatenate([half[:0:-1, ::-1], half])
     near, far = table[:-1, :-1], table[1:, 1:]
     along, across = table[1:, :-1], table[:-1, 1:]
     cells = np.stack([near, along - near, across - near, far - along - across + near], axis=2)
@@ -125,9 +119,8 @@ def _discrete_gain(a: Floats, b: Floats, q: Floats, r: float) -> Floats:
 def _stable_solution(matrix: Floats, growth: Callable[[NDArray[np.complex128]], Floats]) -> Floats:
     """Return P ``[n, 4, 4]`` whose graph (1, P) spans the stable half of the eigenvectors.
 
-    Args:
-        matrix: ``[n, 8, 8]`` Hamiltonian or symplectic, four eigenvalues on each side.
-        growth: orders the eigenvalues; the four smallest are the stable ones.
+    ``matrix`` ``[n, 8, 8]`` is Hamiltonian or symplectic, with four eigenvalues on each side; the
+    four smallest by ``growth`` are the stable ones.
     """
     eigenvalues, vectors = np.linalg.eig(matrix)
     stable = np.argsort(growth(eigenvalues), axis=-1)[:, None, :4]

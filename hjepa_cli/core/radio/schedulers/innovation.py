@@ -1,4 +1,4 @@
-"""Innovation-triggered: devices say when the controller's prediction has gone wrong, and how far.
+"""Devices report innovations: when the controller's prediction has gone wrong, and how far.
 
 A device that runs no predictor still knows what force the controller plays, from the downlink. It
 compares it with the force that its actor wants and reports the difference, a few bits, when it is
@@ -7,18 +7,22 @@ constant.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hjepa_cli.core.radio.schedulers.view import View
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.radio.schedulers.scheduler import Scheduler, SlotView
+from hjepa_cli.core.style import Style
 
-UNTOLD = 1e-6  # of what devices without a report may err by: they come after all that have one
+UNREPORTED = 1e-6  # of what devices without a report may err by: they come after all that have one
 
 
-def score(view: View) -> NDArray[np.float64]:
-    """The reported e²; a little for what devices without a report have come to.
+def score(view: SlotView) -> Floats:
+    """Return the reported e²; a little of the expected error for devices without a report.
 
     What has become of an error since its report is not guessed: one that has doubled is reported
     again, and one that has waited long is often of a loop that is out of its band anyway.
     """
-    value = view.reported**2 + UNTOLD * view.growth.at(view.age) * view.doubt
+    value = view.reported**2 + UNREPORTED * view.growth.at(view.age) * view.uncertainty
     return np.where(view.able, value, 0.0)
+
+
+INNOVATION = Scheduler("innovation", score, wants_reports=True, style=Style("#0072B2", "o"))

@@ -1,11 +1,12 @@
-"""Largest age of information among the devices that can send now."""
+"""This scheduler takes the largest age of information among the devices that can send now."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hjepa_cli.core.radio.schedulers.view import View
+from hjepa_cli.core.radio.schedulers.scheduler import Scheduler
+from hjepa_cli.core.style import Style
 
-
-def score(view: View) -> NDArray[np.float64]:
-    """The age A."""
-    return np.where(view.able, view.age.astype(np.float64), 0.0)
+MAX_AOI = Scheduler(
+    "max-aoi",
+    lambda view: np.where(view.able, view.age.astype(np.float64), 0.0),
+    style=Style("#009E73", "^", "-."),
+)

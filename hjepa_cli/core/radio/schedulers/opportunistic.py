@@ -1,11 +1,12 @@
-"""Opportunistic: whoever has the best channel, blind to what the loops need."""
+"""The opportunistic scheduler takes whoever has the best channel, blind to the loops."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hjepa_cli.core.radio.schedulers.view import View
+from hjepa_cli.core.radio.schedulers.scheduler import Scheduler
+from hjepa_cli.core.style import DASH_DOT_DOT, Style
 
-
-def score(view: View) -> NDArray[np.float64]:
-    """The power gain |H|²."""
-    return np.where(view.able, view.gain, 0.0)
+OPPORTUNISTIC = Scheduler(
+    "opportunistic",
+    lambda view: np.where(view.able, view.gain, 0.0),
+    style=Style("#E69F00", "D", DASH_DOT_DOT, hollow=True),
+)

@@ -1,11 +1,12 @@
-"""Round robin: everybody in turn, blind to the channel; a blocked device loses its turn."""
+"""Round robin takes everybody in turn, blind to the channel; a blocked device loses its turn."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hjepa_cli.core.radio.schedulers.view import View
+from hjepa_cli.core.radio.schedulers.scheduler import Scheduler
+from hjepa_cli.core.style import Style
 
-
-def score(view: View) -> NDArray[np.float64]:
-    """Slots since the last turn."""
-    return view.waited.astype(np.float64)
+ROUND_ROBIN = Scheduler(
+    "round-robin",
+    lambda view: view.waited.astype(np.float64),
+    style=Style("#7F7F7F", "s", ":", hollow=True),
+)

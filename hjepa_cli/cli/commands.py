@@ -1,0 +1,257 @@
+"""The commands: what each takes, which stage does it, and what is particular about it.
+
+What a command does is imported when it runs, so that ``--help`` and refusals answer at once; the
+program is made of this list in :mod:`hjepa_cli.cli.builder`.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from hjepa_cli.cli.flags import INPUTS
+from hjepa_cli.config.checks import check_cell, compared_methods
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import origins
+from hjepa_cli.errors import UsageError
+from hjepa_cli.plugins import STAGES
+from hjepa_cli.stages.stage import Imported
+
+PIPELINE, TOOLS = "Pipeline", "Tools"
+GROUPS = {
+    "data": "Describe, verify, look at and export datasets.",
+    "models": "List, describe and verify trained models.",
+    "config": "Show settings.",
+}
+
+RESOLVED = ("preset", "config", "plant", "seed")  # what takes these is given settings
+COMPUTED = (*RESOLVED, "device")
+PARALLEL = ("workers", "cluster")
+LOOP = ("methods", "protocol")
+MEASURED = (*LOOP, "protocol.process_noise", "protocol.plant_spread", "protocol.payload")
+
+Given = dict[str, Any]  # what was given, by dotted key or argument; None: not given
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """One command.
+
+    Attributes:
+        name: as typed, with its group.
+        help: what it does.
+        run: the stage; it is called with the settings, if the command takes any, the screen, and
+            what the command takes besides settings.
+        takes: dotted keys of settings and names of :data:`~hjepa_cli.cli.flags.INPUTS`, in the
+            order of help.
+        plan: what ``--dry-run`` shows; it is called with those arguments of ``run`` that it has.
+        product: key of the result that a quiet run prints: the path that it made.
+        shared: several processes of torchrun may do it together.
+        prepare: changes what was given before settings are made of it.
+        check: refuses what does not go with the settings, or adds what follows from both.
+        panel: where the program's help lists a command that is in no group.
+    """
+
+    name: str
+    help: str
+    run: Callable[..., Any]
+    takes: tuple[str, ...] = ()
+    plan: Callable[..., Any] | None = None
+    product: str | None = None
+    shared: bool = False
+    prepare: Callable[[Given], None] | None = None
+    check: Callable[[Settings, Given], None] | None = None
+    panel: str = PIPELINE
+
+    @property
+    def resolves(self) -> bool:
+        """Return whether its stage is given settings."""
+        return "preset" in self.takes
+
+    @property
+    def all_taken(self) -> tuple[str, ...]:
+        """Return what it takes, with what every command takes."""
+        dry_run = ("dry_run",) if self.plan else ()
+        return (*self.takes, "plugin", "json", "quiet", *dry_run, "debug")
+
+
+def _one_level(given: Given) -> None:
+    """Train a single level where ``--h`` alone is given."""
+    h, m, l = (f"hierarchy.{level}" for level in "hml")
+    if given[h] is not None and given[m] is None and given[l] is None:
+        given[m] = given[l] = given[h]
+
+
+def _figure_of_all(given: Given) -> None:
+    if given["figure"] and given["methods"] is None:
+        given["methods"] = compared_methods()
+
+
+def _one_link(given: Given) -> None:
+    """Refuse two kinds of link, and begin the film with the start."""
+    gap, delivery = given["gap_steps"], given["delivery"]
+    if gap is not None and delivery is not None:
+        raise UsageError(
+            "--gap is a link without fading, --delivery is of one with; give one of them",
+            hint=f"hjepa view --gap {gap:g}, or hjepa view --delivery {delivery:g}",
+        )
+    given |= {"protocol": "paper", "delivery": 0.05 if delivery is None else delivery}
+
+
+def _check_cell(settings: Settings, given: Given) -> None:
+    from hjepa_cli.core.radio.capacity import parse_snr
+
+    parse_snr(settings.radio.snr_db)
+    keys = (name.partition(":")[0] for name in SCALE)
+    check_cell(settings.radio, {key: given[key] for key in keys})
+
+
+def _add_sources(settings: Settings, given: Given) -> None:
+    """Tell ``config show`` where its values come from."""
+    flags = {key: given[key] for key in (*LOOP, "plant", "seed", "device")}
+    given["sources"] = origins(settings.preset, given["config"], flags)
+
+
+SCALE = (
+    *("radio.snr_db", "radio.law", "radio.schedulers", "radio.uncertainty", "radio.topology"),
+    *("radio.bandwidth_hz", "radio.noise", "radio.power_margin_db", "radio.coherence_slots"),
+    *("radio.seeds", *MEASURED, "remeasure", "verify", "checkpoint", "dataset:clean", "out"),
+)
+
+
+def staged(name: str, takes: tuple[str, ...] = (), further: str = "", **more: Any) -> Command:
+    """Return the command of a stage, which says itself what it does; takes what a plugin's may."""
+    one = STAGES[name]
+    words = takes or (*(word for word in one.inputs if word in INPUTS), "out", *COMPUTED)
+    text = f"{one.help}\n\n{further}".strip()
+    return Command(name, text, one.run, words, one.plan, one.product, one.shared, **more)
+
+
+def commands() -> tuple[Command, ...]:
+    """Return the commands of the package, and one for each stage that plugins in force add."""
+    own = {command.name for command in COMMANDS}
+    return (*COMMANDS, *(staged(name) for name in STAGES if name not in own))
+
+
+COMMANDS = (
+    staged(
+        "collect",
+        takes=(
+            *("collect.trajectories", "collect.test_trajectories", "collect.steps"),
+            *("collect.frames", "out", *RESOLVED, *PARALLEL),
+        ),
+    ),
+    staged(
+        "train-encoder",
+        takes=(
+            *("encoder.method", "encoder.frames", "encoder.h", "encoder.steps", "encoder.gate"),
+            *("dataset", "out", *COMPUTED),
+        ),
+    ),
+    staged(
+        "train-hierarchy",
+        further="--h without --m and --l trains a single level: TS-JEPA of that depth.",
+        takes=("hierarchy.h", "hierarchy.m", "hierarchy.l", "dataset", "encoder", "out", *COMPUTED),
+        prepare=_one_level,
+    ),
+    staged(
+        "train-reflex",
+        further="Methods hold-decay, hold-decay-linear, chunk and chunk-forces, on a trained "
+        "model's encoder.",
+        takes=("dataset", "checkpoint", "out", *COMPUTED),
+    ),
+    staged(
+        "eval",
+        takes=(
+            *(*MEASURED, "remeasure", "figure", "checkpoint", "dataset:clean", "out"),
+            *(*COMPUTED, *PARALLEL),
+        ),
+        prepare=_figure_of_all,
+    ),
+    staged("scale", takes=(*SCALE, *COMPUTED, *PARALLEL), check=_check_cell),
+    Command(
+        "resume",
+        "Take up an interrupted run: same settings, same inputs, same result.",
+        Imported("hjepa_cli.stages.resume:run"),
+        ("directory", *PARALLEL),
+        plan=Imported("hjepa_cli.stages.resume:plan"),
+        shared=True,
+    ),
+    staged("reproduce", takes=(*LOOP, "out", *COMPUTED, *PARALLEL)),
+    Command(
+        "view",
+        "Watch closed loops over a fading link: true pole, believed pole, packets, SNR, age.",
+        Imported("hjepa_cli.stages.view:run"),
+        (
+            *("methods:view", "devices", "snr_db", "delivery", "gap_steps", "every", "fps", "live"),
+            *("radio.bandwidth_hz", "checkpoint", "out:animation", *COMPUTED),
+        ),
+        plan=Imported("hjepa_cli.stages.view:plan"),
+        product="file",
+        prepare=_one_link,
+        panel=TOOLS,
+    ),
+    Command(
+        "report",
+        "Write what runs found as one HTML file: figures, tables, settings, commands.",
+        Imported("hjepa_cli.stages.report:run"),
+        ("paths:runs", "out:report", "figures", "formats"),
+        product="report",
+        panel=TOOLS,
+    ),
+    Command(
+        "compare",
+        "Average evaluations over training seeds: means, 95 % intervals, paired differences.",
+        Imported("hjepa_cli.stages.compare:run"),
+        ("paths:evaluations", "methods:compare", "figures:compare", "formats"),
+        panel=TOOLS,
+    ),
+    Command(
+        "data info",
+        "Describe a dataset: plant, seed, splits, size, sha256.",
+        Imported("hjepa_cli.stages.data:show_info"),
+        ("path",),
+    ),
+    Command(
+        "data verify",
+        "Read every shard and check it against its sha256; without a name, all of data/.",
+        Imported("hjepa_cli.stages.data:verify"),
+        ("paths:datasets",),
+    ),
+    Command(
+        "data preview",
+        "Draw a contact sheet of camera frames (PNG).",
+        Imported("hjepa_cli.stages.data:preview"),
+        ("path", "split", "rows", "columns", "out:file"),
+        product="picture",
+    ),
+    Command(
+        "data export",
+        "Write one split for other programs: HDF5 in stable-worldmodel's layout, or NPZ.",
+        Imported("hjepa_cli.stages.data:export"),
+        ("path", "split", "kind", "pixels", "out:file"),
+        plan=Imported("hjepa_cli.stages.data:plan_export"),
+        product="file",
+    ),
+    Command(
+        "models list", "List the models of the zoo.", Imported("hjepa_cli.stages.models:show_list")
+    ),
+    Command(
+        "models info",
+        "Describe one model: architecture, training, health, sha256.",
+        Imported("hjepa_cli.stages.models:show_info"),
+        ("name_or_path",),
+    ),
+    Command(
+        "models verify",
+        "Check models against their sha256; without a name, all of the zoo.",
+        Imported("hjepa_cli.stages.models:verify"),
+        ("names",),
+    ),
+    Command(
+        "config show",
+        "Print every setting that a command would use, and where it comes from.",
+        Imported("hjepa_cli.stages.show_config:show"),
+        ("key", "as_toml", *LOOP, *COMPUTED),
+        check=_add_sources,
+    ),
+)

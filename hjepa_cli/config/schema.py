@@ -1,0 +1,482 @@
+"""Every setting, declared once: its type, bounds, default, and the flag that overrides it.
+
+The command line builds its flags and their help from these declarations, and
+:mod:`hjepa_cli.config.settings` checks files and flags against them. Units are in the names. Where
+the paper gives a value the default is that value, but for the protocol's, which are those of
+``--protocol paper``; the rest is ours (docs/paper_map.md).
+"""
+
+import dataclasses
+import functools
+import sys
+import typing
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
+
+LARGEST = sys.float_info.max  # bounds what is not bounded otherwise: no infinity, no NaN
+LARGEST_SEED = 2**63 - 1
+CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
+
+Count = Annotated[int, Meta(ge=1)]
+CountFromTwo = Annotated[int, Meta(ge=2)]  # nothing is learned without a next one
+CountOrNone = Annotated[int, Meta(ge=0)]
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
+Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
+BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Flag:
+    """How the command line calls a value.
+
+    Attributes:
+        name: ``"--steps"``, or ``"--gate/--no-gate"`` of a switch that has two.
+        help: what it means, as a sentence; ``{choices}`` stands for the names that there are.
+        metavar: placeholder of the value; empty: ``N`` of a count, the choices of a few words.
+        unit: how much of the setting's unit one of the flag's is, as in ``--bandwidth-mhz``.
+    """
+
+    name: str
+    help: str
+    metavar: str = ""
+    unit: float = 1.0
+
+
+STRIDE_H = Flag("--h", "Stride of the high level in control steps, a multiple of m.")
+
+
+@dataclasses.dataclass(frozen=True)
+class CollectSettings:
+    """``collect``: how the dataset is made."""
+
+    trajectories: Annotated[Count, Flag("--trajectories", "Training trajectories.")] = 200
+    test_trajectories: Annotated[Count, Flag("--test-trajectories", "Held-out trajectories.")] = 40
+    clean_trajectories: Count = 40
+    steps: Annotated[CountFromTwo, Flag("--steps", "Control steps per trajectory.")] = 100
+    clean_steps: Count = 120
+    # Initial states are uniform in ± these; none: the next four, a cart-pole's.
+    start: tuple[NotNegative, ...] = ()
+    x_m: NotNegative = 0.1
+    x_dot_m_s: NotNegative = 0.5
+    theta_rad: NotNegative = 0.35
+    theta_dot_rad_s: NotNegative = 5.0
+    exploration_n: NotNegative = 4.0
+    exploration_hold_steps: Count = 10
+    frames: Annotated[
+        Literal["rendered", "stored"],
+        Flag("--frames", "Render camera frames when they are read, or store them with the states."),
+    ] = "rendered"
+
+    @property
+    def half_widths(self) -> tuple[float, ...]:
+        """Return how far initial states lie from zero at most, one per state."""
+        return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
+
+
+@dataclasses.dataclass(frozen=True)
+class EncoderSettings:
+    """``train-encoder``: the JEPA with its companion P^H, then the probe actor; or a baseline."""
+
+    method: Annotated[
+        Literal["jepa", "supervised", "autoencoder"],
+        Flag(
+            "--method",
+            "What to train: the joint-embedding encoder, or a baseline that acts on raw frames.",
+        ),
+    ] = "jepa"
+    frames: Annotated[  # κ
+        Count,
+        Flag("--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
+    ] = 2
+    embedding: Count = 256
+    hidden: Count = 1024
+    h: Annotated[Count, STRIDE_H] = 4
+    frame_input: Literal["difference", "pair"] = "difference"
+    stride_actions: Literal["all", "held"] = "all"
+    residual: bool = True
+    centre: bool = True
+    steps: Annotated[Count, Flag("--steps", "Training steps of the encoder.")] = 1200
+    batch_trajectories: Count = 10
+    batch_frames: CountFromTwo = 25  # of a trajectory, h steps apart; rollouts end where they do
+    rollout_steps: Count = 80
+    optimizer: Literal["adamw", "sgd"] = "adamw"
+    schedule: Literal["one-cycle", "constant"] = "one-cycle"
+    learning_rate: NotNegative = 1e-3
+    weight_decay: NotNegative = 1e-2
+    gradient_clip: NotNegative = 1.0  # 0 does not clip, here and below
+    ema_decay: BelowOne = 0.99
+    inverse_dynamics: NotNegative = 1.0
+    regulariser: Literal["none", "vicreg", "sigreg"] = "none"  # against collapse, for comparison
+    regulariser_weight: NotNegative = 0.1
+    # "exact": networks that commute with a mirror; "augment" flips at random.
+    mirror: Literal["exact", "augment", "none"] = "exact"
+    shift_px: CountOrNone = 8  # sideways; no further than every cart stays in the picture
+    light_spread: BelowOne = 0.0  # training pictures: each trajectory in a light of 1 ± this
+    camera_noise: NotNegative = 0.0  # and with noise of up to this standard deviation, of 255
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    gate: Annotated[
+        bool,
+        Flag(
+            "--gate/--no-gate",
+            "Stop with exit code 70 when the health of the encoder misses a gate, or keep it.",
+        ),
+    ] = True
+    gate_r2: tuple[Number, ...] = ()  # of every state; none: the next four, a cart-pole's
+    gate_r2_x: Number = 0.95
+    gate_r2_x_dot: Number = 0.90
+    gate_r2_theta: Number = 0.80
+    gate_r2_theta_dot: Number = 0.90
+    gate_rank: Number = 4.0
+    gate_sensitivity: Number = 0.1
+    gate_actor_nrmse: Number = 0.35
+
+    @property
+    def least_r2(self) -> tuple[float, ...]:
+        """Return the gates of the linear probes, one per state."""
+        four = (self.gate_r2_x, self.gate_r2_x_dot, self.gate_r2_theta, self.gate_r2_theta_dot)
+        return self.gate_r2 or four
+
+
+@dataclasses.dataclass(frozen=True)
+class ActorSettings:
+    """The semantic actor, fitted by both training stages."""
+
+    hidden: Count = 1024
+    dropout: BelowOne = 0.2
+    schedule: Literal["one-cycle", "constant"] = "one-cycle"
+    learning_rate: NotNegative = 1e-3
+    weight_decay: NotNegative = 1e-2
+    gradient_clip: NotNegative = 1.0
+    batch: Count = 200
+    epochs: Count = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class HierarchySettings:
+    """``train-hierarchy``: P^H, P^M, P^L and ts-jepa-1 on frozen embeddings."""
+
+    h: Annotated[Count, STRIDE_H] = 4
+    m: Annotated[Count, Flag("--m", "Stride of the medium level, a multiple of l.")] = 2
+    l: Annotated[Count, Flag("--l", "Stride of the low level.")] = 1
+    # Of the pictures, sideways by up to encoder.shift_px, for actor and levels.
+    shifted_copies: CountOrNone = 4
+    rollout_steps: Count = 80
+    batch_trajectories: Count = 16
+    coarse_starts: Count = 8
+    flat_starts: Count = 4
+    fine_trajectories: Count = 80
+    optimizer: Literal["adamw", "sgd"] = "adamw"
+    schedule: Literal["one-cycle", "constant"] = "one-cycle"
+    gradient_clip: NotNegative = 1.0
+    coarse_steps: Count = 1600
+    coarse_learning_rate: NotNegative = 1e-3
+    coarse_weight_decay: NotNegative = 1e-3
+    flat_steps: Count = 1600  # ts-jepa-1 starts from nothing, P^H from the encoder's companion
+    medium_steps: Count = 1000
+    medium_learning_rate: NotNegative = 1e-3
+    medium_weight_decay: NotNegative = 2e-4
+    low_steps: Count = 1000
+    low_learning_rate: NotNegative = 1e-3
+    low_weight_decay: NotNegative = 4e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class ReflexSettings:
+    """``train-reflex``: what answers a packet by its age, and the search for decaying holds."""
+
+    forces_at_once: Count = 4  # of the chunk; as many as P^H plans
+    steps: Count = 1600
+    batch_packets: Count = 64  # as many as ts-jepa-1 has rollouts
+    batch_ages: Count = 32  # of each packet
+    learning_rate: NotNegative = 1e-3
+    weight_decay: NotNegative = 1e-3
+    gradient_clip: NotNegative = 1.0
+    search_devices: Count = 32  # on the true state, of gains and decay together
+    search_steps: Count = 1000
+    search_candidates: Count = 48
+    search_rounds: Count = 10
+    fit_devices: Count = 24  # on embeddings, of a factor and the decay
+    fit_candidates: Count = 12
+    fit_rounds: Count = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class ProtocolSettings:
+    """``eval`` and ``scale``: the closed-loop protocol."""
+
+    warmup_steps: CountOrNone = 1000  # not scored: they remember the start
+    steps: Count = 3000  # scored
+    curve_devices: Count = 64
+    bracket_devices: Count = 64
+    start: tuple[NotNegative, ...] = ()  # as in [collect]
+    x_m: NotNegative = 0.03
+    x_dot_m_s: NotNegative = 0.1
+    theta_rad: NotNegative = 0.08
+    theta_dot_rad_s: NotNegative = 0.5
+    # Standard deviation of every state and control step; none: the next two, a cart-pole's.
+    noise: tuple[NotNegative, ...] = ()
+    noise_x_dot_m_s: NotNegative = 0.002
+    noise_theta_dot_rad_s: NotNegative = 0.03
+    process_noise: Annotated[
+        Literal["velocity", "isotropic"],
+        Flag("--process-noise", "Noise on the two velocities, or on all four states (the paper)."),
+    ] = "velocity"
+    plant_spread: Annotated[
+        BelowOne,
+        Flag(
+            "--plant-spread",
+            "Relative spread of the masses between devices; 0: all are equal.",
+            "FRACTION",
+        ),
+    ] = 0.0
+    payload: Annotated[
+        str,
+        Flag(
+            "--payload",
+            "How an embedding is sent: float32, float16, int2 to int16, or pca-NxB for N principal "
+            "components of B bits.",
+            "NAME",
+        ),
+    ] = "int8"
+    gaps: tuple[Count, ...] = (1, 20, 40, 80, 120, 160, 240, 320)
+    acceptable_score: Positive = 0.62
+    acceptable_lq_ratio: NotNegative = 0.5
+    bracket: Annotated[float, Meta(gt=0, lt=1)] = 0.03
+    horizon: Count = 100
+    bootstrap: Count = 1000
+
+    @property
+    def half_widths(self) -> tuple[float, ...]:
+        """Return how far initial states lie from zero at most, one per state."""
+        return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
+
+    @property
+    def total_steps(self) -> int:
+        """Return the steps of a simulation: the warm-up, then those that are scored."""
+        return self.warmup_steps + self.steps
+
+    @property
+    def velocity_noise(self) -> tuple[float, ...]:
+        """Return the standard deviation of what disturbs a step, one per state."""
+        return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
+
+
+# What --protocol paper sets over these: scored from the start on.
+PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
+
+
+@dataclasses.dataclass(frozen=True)
+class ConditionSettings:
+    """``eval`` and ``scale``: how devices differ from those that models were trained on.
+
+    Beside ``protocol.plant_spread``; controllers do not know.
+    """
+
+    light: Positive = 1.0  # factor on what the camera sees
+    camera_noise: NotNegative = 0.0  # standard deviation in every pixel, of 255
+    pole_length: Positive = 1.0  # ÷ the nominal one
+
+
+@dataclasses.dataclass(frozen=True)
+class RadioSettings:
+    """``scale``: the radio cell."""
+
+    law: Annotated[
+        str,
+        Flag(
+            "--law",
+            "How devices share the band: by turns at controlled power, all at once in equal parts, "
+            "or as a scheduler decides.",
+        ),
+    ] = "duty"
+    snr_db: Annotated[
+        str,
+        Flag(
+            "--snr",
+            "Signal-to-noise ratios in dB, both ends included; step 5 unless given (10:30 is "
+            "10, 15, 20, 25, 30), or a comma list.",
+            "START:STOP[:STEP]",
+        ),
+    ] = "10:30"
+    bandwidth_hz: Annotated[  # at most: beyond any radio band; keeps device counts in range
+        float,
+        Meta(gt=0, le=1e11),
+        Flag("--bandwidth-mhz", "Bandwidth of the cell.", "MHZ", unit=1e6),
+    ] = 20e6
+    noise: Annotated[
+        Literal["fixed", "scaled"],
+        Flag(
+            "--noise",
+            "Noise power fixed (the paper), or scaled with each device's bandwidth (law equal).",
+        ),
+    ] = "fixed"
+    # The rest is for the law "scheduled".
+    schedulers: Annotated[
+        tuple[str, ...],
+        Flag(
+            "--scheduler", "Schedulers of the law scheduled, separated by commas: {choices}.", "A,B"
+        ),
+    ] = ("round-robin", "max-aoi", "innovation")
+    uncertainty: Annotated[
+        Literal["age", "levels"],
+        Flag(
+            "--uncertainty",
+            "Law scheduled: of a prediction by its age, or also by how far a hierarchy's levels "
+            "disagree; for the schedulers whittle and innovation.",
+        ),
+    ] = "age"
+    seeds: Annotated[
+        Count, Flag("--seeds", "Law scheduled: seeds to average over, counted up from --seed.")
+    ] = 1
+    power_margin_db: Annotated[
+        NotNegative,
+        Flag(
+            "--power-margin-db",
+            "Law scheduled: deepest fade that power control makes up for.",
+            "DB",
+        ),
+    ] = 10.0
+    coherence_slots: Annotated[
+        float,
+        Meta(ge=1, le=LARGEST),
+        Flag(
+            "--coherence-slots",
+            "Law scheduled: mean number of slots that a fade lasts; 1: independent.",
+            "SLOTS",
+        ),
+    ] = 1.0
+    overhead_bits: CountOrNone = 0  # CRC and header of a packet
+    # 0: capacity; else the normal approximation at this error rate.
+    block_error: Annotated[float, Meta(ge=0, le=0.5)] = 0.0
+    # Copies of a sample that may be combined; 1: always send the newest.
+    harq_rounds: Annotated[int, Meta(ge=1, le=16)] = 1
+    topology: Annotated[  # "hall": margins from geometry instead of power_margin_db
+        Literal["target", "hall"],
+        Flag(
+            "--topology",
+            "Law scheduled: one power margin for all, or devices dropped into a factory hall.",
+        ),
+    ] = "target"
+    scenario: Literal["InF-LOS", "InF-SL", "InF-DL", "InF-SH", "InF-DH"] = "InF-SH"
+    # Carrier, power and noise figure: TS-JEPA's, its -95 dBm over 20 MHz.
+    carrier_ghz: Annotated[float, Meta(ge=CARRIER_GHZ[0], le=CARRIER_GHZ[1])] = 3.75
+    power_dbm: Number = 23.0
+    noise_figure_db: NotNegative = 6.0
+
+    @property
+    def load_depends_on_snr(self) -> bool:
+        """Return whether it does under law scheduled: by margins in a hall, or by repetitions."""
+        return self.topology == "hall" or (self.harq_rounds > 1 and self.block_error > 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Everything that defines a run besides the paths it reads and writes."""
+
+    preset: str = "default"
+    plant: Annotated[str, Flag("--plant", "What to control.")] = "desktop"
+    seed: Annotated[
+        int, Meta(ge=0, le=LARGEST_SEED), Flag("--seed", "Seed of everything random.")
+    ] = 0
+    device: Annotated[
+        Literal["auto", "cpu", "cuda"], Flag("--device", "Where to compute; auto: cuda if there.")
+    ] = "auto"
+    methods: Annotated[
+        tuple[str, ...],
+        Flag("--methods", "Methods to compare, separated by commas: {choices}.", "A,B,C"),
+    ] = (
+        *("hjepa", "ts-jepa-1", "ts-jepa-4", "chunk", "hold-decay-linear"),
+        *("hold", "optimal", "oracle"),
+    )
+    collect: CollectSettings = CollectSettings()
+    encoder: EncoderSettings = EncoderSettings()
+    actor: ActorSettings = ActorSettings()
+    hierarchy: HierarchySettings = HierarchySettings()
+    reflex: ReflexSettings = ReflexSettings()
+    protocol: ProtocolSettings = ProtocolSettings()
+    conditions: ConditionSettings = ConditionSettings()
+    radio: RadioSettings = RadioSettings()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return nested plain data, ready for JSON (tuples become lists).
+
+        Empty lists are left out: they stand for values that say the same, and digests of settings
+        stay what they were before there were such lists.
+        """
+        return typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+
+
+@functools.cache
+def declared() -> dict[str, Any]:
+    """Return the annotated type of every setting by its dotted key."""
+    found: dict[str, Any] = {}
+    for name, kind in typing.get_type_hints(Settings, include_extras=True).items():
+        if dataclasses.is_dataclass(kind):
+            fields = typing.get_type_hints(kind, include_extras=True)
+            found |= {f"{name}.{field}": hint for field, hint in fields.items()}
+        else:
+            found[name] = kind
+    return found
+
+
+def flag_of(hint: Any) -> Flag | None:
+    """Return the flag in an annotated type, if it has one."""
+    return next((one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Flag)), None)
+
+
+def choices_of(hint: Any) -> tuple[str, ...]:
+    """Return the words that a type allows; none of them of one that allows others."""
+    plain = bare(hint)
+    return typing.get_args(plain) if typing.get_origin(plain) is Literal else ()
+
+
+def bare(hint: Any) -> Any:
+    """Return a type without what is annotated to it."""
+    return hint.__origin__ if hasattr(hint, "__metadata__") else hint
+
+
+def must_be(hint: Any, unit: float = 1.0) -> str:
+    """Say what values a type allows, in a flag's unit: ``"a whole number of at least 1"``."""
+    plain = bare(hint)
+    if choices := choices_of(hint):
+        return f"one of {', '.join(choices)}"
+    if typing.get_origin(plain) is tuple:
+        return "a list"
+    if plain not in (int, float):
+        return {bool: "true or false", str: "text"}[plain]
+    noun = "a whole number" if plain is int else "a finite number"
+    bounds = {
+        side: f"{value / unit:g}" if plain is float else str(value)
+        for meta in hint.__metadata__
+        if isinstance(meta, Meta)
+        for side in ("ge", "gt", "le", "lt")
+        if (value := getattr(meta, side)) is not None and abs(value) != LARGEST
+    }
+    if "ge" in bounds and "le" in bounds:
+        return f"{noun} from {bounds['ge']} to {bounds['le']}"
+    words = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+    parts = " and ".join(f"{words[side]} {value}" for side, value in bounds.items())
+    return f"{noun} of {parts}" if parts else noun
+
+
+def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
+    """Return nested values by the path to them: ``{"a": {"b": 1}}`` → ``{"a.b": 1}``."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            below = dotted(value, separator)
+            flat |= {f"{key}{separator}{name}": entry for name, entry in below.items()}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items() if entry != ()}
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
+    return value

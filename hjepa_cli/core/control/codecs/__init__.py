@@ -1,0 +1,1 @@
+"""Codecs turn an embedding into bits; each family has a file, and the registry lists them."""

@@ -1,0 +1,63 @@
+"""A codec makes an embedding the bits of a packet, and an embedding again.
+
+Codecs are looked up by the names that users give as payload (``plugins.CODECS["pca-8x6"]``). The
+closed loop really encodes and decodes, so the bits counted are bits the controller lives on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from hjepa_cli.config.schema import Settings
+    from hjepa_cli.core.networks.model import Model
+
+
+class Coder(Protocol):
+    """Is both ends of a link: a codec made ready for the embeddings of one model."""
+
+    @property
+    def bits(self) -> int:
+        """Return the bits of one transmission."""
+        ...
+
+    def send(self, z: Tensor) -> Tensor:
+        """Send embeddings [n, D]; the controller receives [n, D], float32."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Codec:
+    """Sends embeddings in one way.
+
+    Attributes:
+        name: as in ``--payload``.
+        bits: counts the bits of one transmission of an embedding with D values.
+        fit: makes it ready for a model; raises UsageError where the model's embeddings do not suit.
+        fitted: it is fitted to trajectories drawn from the settings, so that curves measured
+            through it depend on them.
+    """
+
+    name: str
+    bits: Callable[[int], int]
+    fit: Callable[[Model, Settings], Coder]
+    fitted: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class CodecFamily:
+    """Makes codecs whose names hold numbers.
+
+    Attributes:
+        name: stands for all of theirs, as ``pca-NxB``.
+        member: makes the codec of a name; ``None`` where no codec of the family is called so.
+        described: the names once more for messages, with the valid numbers.
+    """
+
+    name: str
+    member: Callable[[str], Codec | None]
+    described: str

@@ -1,0 +1,136 @@
+"""Drivers are methods made ready to drive the devices of one plant with one model.
+
+A method (:mod:`hjepa_cli.core.control.methods`) is a description; what it builds is a
+:class:`Driver`: the sensor that runs on each device, and controllers for as many devices as there
+are. Methods on embeddings send Ψ(previous frame, current frame), really rendered, encoded,
+quantised and dequantised.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from hjepa_cli.config.checks import late, split_late
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.codecs.codec import Coder
+from hjepa_cli.core.control.controllers import LastForce
+from hjepa_cli.core.control.disagreement import TwoLevels
+from hjepa_cli.core.control.loop import Controller, Sensor
+from hjepa_cli.core.control.sensors import embedding_sensor
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.networks.planning import Planner
+from hjepa_cli.core.plants.conditions import actual_camera
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.system import System
+from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.plugins import CODECS, METHODS
+
+
+@dataclasses.dataclass(frozen=True)
+class Driver:
+    """Drives the devices in one way.
+
+    Attributes:
+        name: of the method, on time or late.
+        sensor: what a device sends.
+        controller: builds a fresh controller for n devices.
+        reactive: builds one that only acts on packets, for links that deliver at every step.
+        bits_per_transmission: what a transmission costs.
+        family: drivers of one family play the same when a packet arrives at every step.
+        uses_link: whether the method needs one.
+        two_levels: builds the controller with a second level beside it, where the method has two.
+        delay_steps: how long its packets are under way.
+    """
+
+    name: str
+    sensor: Sensor
+    controller: Callable[[int], Controller]
+    reactive: Callable[[int], Controller]
+    bits_per_transmission: int
+    family: str
+    uses_link: bool = True
+    two_levels: Callable[[int], TwoLevels] | None = None
+    delay_steps: int = 0
+
+
+def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
+    """Build any method by its name, on time or :func:`~hjepa_cli.config.checks.late`.
+
+    Raises:
+        UsageError: no such method, no model that holds it, or a lateness that is no number.
+        DataError: the model is of another plant.
+    """
+    name, steps = split_late(name)
+    if model and model.plant_name != settings.plant:
+        raise DataError(
+            f"the model drives plant {model.plant_name}, not {settings.plant}",
+            hint=f'add settings={{"plant": "{model.plant_name}"}}, or pass another model',
+        )
+    if METHODS[name].needs_model and (model is None or name not in methods_of(model)):
+        raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")
+    driver: Driver = METHODS[name].build(settings, model)
+    return dataclasses.replace(
+        driver, name=late(name, steps), family=late(driver.family, steps), delay_steps=steps
+    )
+
+
+def embedding_driver(
+    name: str,
+    settings: Settings,
+    model: Model,
+    controller: Callable[[int], Controller] | None = None,
+    two_levels: Callable[[int], TwoLevels] | None = None,
+    family: str = "embedding",
+) -> Driver:
+    """Build a driver on embeddings, which the model's actor answers where a packet arrives.
+
+    Without a ``controller`` for what is in between the last force stays. A ``family`` of its own
+    has no other controller for links that deliver at every step.
+    """
+    coder, hold = coder_of(settings, model), last_force(model)
+    sensor = embedding_sensor(model, coder.send, actual_camera(settings))
+    drives = controller or hold
+    reactive = hold if family == "embedding" else drives
+    return Driver(name, sensor, drives, reactive, coder.bits, family, two_levels=two_levels)
+
+
+def last_force(
+    model: Model, actor: Callable[[Any], Any] | None = None, *, keep: bool = True
+) -> Callable[[int], LastForce]:
+    """Return what builds :class:`LastForce` for a model's plant, by default with its actor."""
+    shape = model.action_shape
+    return functools.partial(LastForce, actor or model.actor, keep=keep, action_shape=shape)
+
+
+def coder_of(settings: Settings, model: Model) -> Coder:
+    """Return what the settings' payload sends a model's embeddings through.
+
+    Raises UsageError for no such payload, or one that the model's embeddings do not suit.
+    """
+    coder: Coder = CODECS[settings.protocol.payload].fit(model, settings)
+    return coder
+
+
+def methods_of(model: Model) -> tuple[str, ...]:
+    """Return what a model can drive its own plant with."""
+    return offered_methods(model.architecture, plant(model.plant_name))
+
+
+def offered_methods(architecture: Mapping[str, Any], kind: System) -> tuple[str, ...]:
+    """Return the methods that a model of this architecture can drive a plant with."""
+    offers = (method.offers(architecture, kind) for method in METHODS.values())
+    return tuple(name for names in offers for name in names)
+
+
+def planner_of(model: Model, method: str) -> Planner:
+    """Return the planner behind ``method``.
+
+    Raises:
+        UsageError: this model does not predict with that method.
+    """
+    planners = {name: made for name in methods_of(model) if (made := METHODS[name].planner)}
+    if method not in planners:
+        raise UsageError(f"this model has no planner '{method}'; choose from {', '.join(planners)}")
+    planner: Planner = planners[method](model)
+    return planner

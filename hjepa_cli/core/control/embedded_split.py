@@ -1,0 +1,55 @@
+"""Closed-form fits take embeddings of trajectories like those that a model was trained on.
+
+The trajectories are drawn from the settings' seed, so that a fit is the same wherever it is made.
+"""
+
+import dataclasses
+import functools
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.sensors import embedding_sensor
+from hjepa_cli.core.datasets.trajectories import generate
+from hjepa_cli.core.plants.frames import frames_seen
+from hjepa_cli.core.plants.named import plant
+
+if TYPE_CHECKING:
+    from hjepa_cli.core.networks.model import Model
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EmbeddedSplit:
+    """Holds embedded trajectories of one split.
+
+    Attributes:
+        z: embeddings of k = 0 … T − 1 [N, T, D], float32, on the CPU.
+        states: the states behind them [N, T, S].
+        actions: forces ÷ force limit from each step to the next [N, T, F], of a device in a row.
+    """
+
+    z: Tensor
+    states: Floats
+    actions: Floats
+
+
+@functools.lru_cache(maxsize=2)  # the splits of one model
+def embed_split(model: "Model", settings: Settings, split: str) -> EmbeddedSplit:
+    """Embed a whole split (``train`` or ``test``) of the settings."""
+    drawn, kind = generate(settings, split), plant(model.plant_name)
+    count, steps = drawn.applied_n.shape[:2]
+    seen = frames_seen(np.arange(steps), model.frames)
+    z = embed_states(model, drawn.states[:, seen].reshape(count * steps, *seen.shape[1:], -1))
+    return EmbeddedSplit(
+        z.reshape(count, steps, -1),
+        drawn.states[:, 1:].astype(np.float64),
+        drawn.applied_n.reshape(count, steps, -1).astype(np.float64) / kind.force_limit_n,
+    )
+
+
+def embed_states(model: "Model", seen: Floats) -> Tensor:
+    """Embed what the plant's camera shows of states [n, κ, S], the present one last: [n, D]."""
+    return embedding_sensor(model)(seen).cpu()

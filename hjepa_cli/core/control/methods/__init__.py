@@ -1,0 +1,1 @@
+"""Methods drive devices; each family has a file, and the registry lists them."""

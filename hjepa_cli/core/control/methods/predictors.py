@@ -1,0 +1,127 @@
+"""Methods ``hjepa``, ``ts-jepa-N`` and ``linear`` predict embeddings between packets.
+
+N is any depth; ``linear`` is fitted in closed form.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from hjepa_cli.core.control.methods.method import Method, MethodFamily, of_hierarchy, training
+from hjepa_cli.core.style import Style
+
+if TYPE_CHECKING:
+    from hjepa_cli.config.schema import Settings
+    from hjepa_cli.core.control.controllers import StrideController
+    from hjepa_cli.core.control.drivers import Driver
+    from hjepa_cli.core.networks.model import Model
+    from hjepa_cli.core.networks.planning import Planner
+
+
+def predictor(name: str, planner: Callable[[Model], Planner], **about: Any) -> Method:
+    """Describe a method that plays a model's predictor, a stride at a time.
+
+    Args:
+        name: of the method.
+        planner: makes the planner from a model that offers the method.
+        about: the other fields of :class:`~hjepa_cli.core.control.methods.method.Method`.
+    """
+
+    def build(settings: Settings, model: Model) -> Driver:
+        from hjepa_cli.core.control.disagreement import TwoLevels
+        from hjepa_cli.core.control.drivers import embedding_driver
+        from hjepa_cli.core.control.planners import OnePredictor
+
+        drives = _strides(model, planner(model))
+
+        def two_levels(devices: int) -> TwoLevels:
+            step = OnePredictor(model, model.networks["flat"], 1).step
+            return TwoLevels(drives(devices), step, model.actor, model.force_limit_n)
+
+        return embedding_driver(
+            name, settings, model, drives, two_levels if planner is _hierarchy else None
+        )
+
+    return Method(name, "embedding", build, planner=planner, **about)
+
+
+def _strides(model: Model, planner: Planner) -> Callable[[int], StrideController]:
+    from hjepa_cli.core.control.controllers import StrideController
+
+    return functools.partial(StrideController, planner, action_shape=model.action_shape)
+
+
+def _hierarchy(model: Model) -> Planner:
+    from hjepa_cli.core.control.planners import Hierarchy
+
+    return Hierarchy(model)
+
+
+HJEPA = predictor(
+    "hjepa",
+    _hierarchy,
+    offered=lambda architecture, plant: architecture["kind"] == "hierarchy",
+    trained_by=training("train-hierarchy"),
+    compared=True,
+    style=Style("#0072B2", "o", size=7.0),
+)
+
+_STYLES = {  # of the depths that the paper compares
+    1: Style("#D55E00", "s", "--", size=2.8),
+    2: Style("#56B4E9", "<", "--"),
+    3: Style("#56B4E9", ">", "-."),
+    4: Style("#009E73", "^", "-.", size=5.0),
+    5: Style("#56B4E9", "p", ":"),
+}
+
+
+def _ts_jepa(name: str) -> Method | None:
+    found = re.fullmatch(r"ts-jepa-([1-9]\d{0,4})", name)
+    if not found:
+        return None
+    depth = int(found[1])
+
+    def planner(model: Model) -> Planner:
+        from hjepa_cli.core.control.planners import OnePredictor
+
+        return OnePredictor(model, model.networks["flat" if depth == 1 else "high"], depth)
+
+    return predictor(
+        name,
+        planner,
+        offered=lambda architecture, plant: (
+            of_hierarchy(architecture, plant) and depth in (1, architecture["h"])
+        ),
+        trained_by=training("train-hierarchy", f" --h {depth}" if depth > 1 else ""),
+        compared=depth in _STYLES,
+        style=_STYLES.get(depth),
+    )
+
+
+TS_JEPA = MethodFamily(
+    "ts-jepa-N",
+    _ts_jepa,
+    lambda architecture: (f"ts-jepa-{architecture.get('h')}", "ts-jepa-1"),
+)
+
+
+def _linear(settings: Settings, model: Model) -> Driver:
+    from hjepa_cli.core.control.drivers import embedding_driver
+    from hjepa_cli.core.control.linear_latent import LinearPlanner, fit_linear_latent
+
+    planner = LinearPlanner(fit_linear_latent(model, settings), model.actor, model.force_limit_n)
+    return embedding_driver("linear", settings, model, _strides(model, planner))
+
+
+LINEAR = Method(
+    "linear",
+    "embedding",
+    _linear,
+    offered=of_hierarchy,
+    trained_by=training("train-hierarchy"),
+    fitted=True,
+    style=Style("#44AA99", "d", "--"),
+)

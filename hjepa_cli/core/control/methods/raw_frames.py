@@ -1,0 +1,53 @@
+"""Methods of this file send camera frames without a codec, act on them and hold the force."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hjepa_cli.core.control.methods.method import Method, training
+from hjepa_cli.core.style import Style
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from hjepa_cli.config.schema import Settings
+    from hjepa_cli.core.control.drivers import Driver
+    from hjepa_cli.core.networks.model import Model
+
+
+def _method(kind: str, frames: int, style: Style) -> Method:
+    """Describe the baseline of an encoder's training method on κ frames."""
+    name = f"{kind}-{frames}"
+
+    def build(settings: Settings, model: Model) -> Driver:
+        from hjepa_cli.core.control.drivers import Driver, last_force
+        from hjepa_cli.core.control.sensors import camera_sensor
+        from hjepa_cli.core.plants.conditions import actual_camera
+        from hjepa_cli.core.plants.frames import FRAME_BITS
+
+        def act(seen: NDArray[np.uint8]) -> Tensor:
+            return model.actor(model.encode(seen).to(model.device))
+
+        look, drives = camera_sensor(model, actual_camera(settings)), last_force(model, act)
+        return Driver(name, look, drives, drives, frames * FRAME_BITS, name)
+
+    return Method(
+        name,
+        "frames",
+        build,
+        offered=lambda architecture, plant: (
+            (architecture["kind"], architecture.get("frames")) == (kind, frames)
+        ),
+        trained_by=training(
+            f"train-encoder --method {kind}" + (f" --frames {frames}" if frames != 2 else "")
+        ),
+        compared=True,
+        style=style,
+    )
+
+
+SUPERVISED_2 = _method("supervised", 2, Style("#882255", "P", "--"))
+SUPERVISED_4 = _method("supervised", 4, Style("#882255", "X", "-."))
+AUTOENCODER_2 = _method("autoencoder", 2, Style("#999933", "h", "--"))

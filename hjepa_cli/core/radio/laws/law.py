@@ -1,0 +1,24 @@
+"""A sharing law says what it is called, and which settings it reads."""
+
+import dataclasses
+from typing import Any
+
+Row = dict[str, Any]  # of ``scale --json``
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SharingLaw:
+    """Describes a way for devices to share a band.
+
+    Attributes:
+        name: as in ``--law``.
+        help: how they share it, in a few words.
+        uses: settings and inputs of ``scale`` that mean nothing under laws that do not list them,
+            as ``"radio.noise"`` and ``"remeasure"``.
+        snr_label: names the SNR on the axis of a figure.
+    """
+
+    name: str
+    help: str
+    uses: tuple[str, ...] = ()
+    snr_label: str = "Target SNR (dB)"

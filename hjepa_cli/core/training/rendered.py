@@ -1,0 +1,75 @@
+"""Rendered trajectories in memory, as training reads them."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hjepa_cli.core.plants.frames import frames_seen
+from hjepa_cli.core.plants.system import System
+from hjepa_cli.core.training.batches import Labels
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderedSplit:
+    """One split in memory, as training reads it.
+
+    Attributes:
+        frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.
+        states: float32 [N, T, S] at k = 0 … T − 1.
+        actions: applied actions ÷ force limit [N, T, *A].
+        labels: teacher's actions ÷ force limit [N, T, *A].
+    """
+
+    frames: Tensor
+    states: Tensor
+    actions: Tensor
+    labels: Tensor
+
+    def seen(self, every: int, *, frames: int = 2, mirrored: bool = False) -> Tensor:
+        """Return what a device looks at in k = 0, ``every``, …: uint8 [N · K, κ, H, W, 3]."""
+        steps = np.arange(0, self.frames.shape[1] - 1, every)
+        seen = self.frames[:, torch.from_numpy(frames_seen(steps, frames))]
+        return (seen.flip(-2) if mirrored else seen).flatten(0, 1)
+
+    def slice(self, start: int, stop: int) -> "RenderedSplit":
+        """Return trajectories ``start`` … ``stop`` − 1."""
+        arrays = (self.frames, self.states, self.actions, self.labels)
+        return RenderedSplit(*(values[start:stop] for values in arrays))
+
+    def states_at(self, every: int) -> Tensor:
+        """Return the states [N · K, S] that go with :meth:`seen`."""
+        return self.states[:, ::every].flatten(0, 1)
+
+    def labels_at(self, every: int) -> Tensor:
+        """Return the labels [N · K, *A] that go with :meth:`seen`."""
+        return self.labels[:, ::every].flatten(0, 1)
+
+
+def labels_of(split: RenderedSplit, kind: System) -> Labels:
+    """Return the teacher's actions on a split: as recorded, or asked anew where pictures move.
+
+    The returned function raises a UsageError for a plant whose pictures cannot be moved.
+    """
+    act = kind.teacher()
+
+    def labels(trajectories: Tensor, k: Tensor, shifts_px: NDArray[np.int64]) -> Tensor:
+        if not shifts_px.any():
+            return split.labels[trajectories, k]
+        states = split.states[trajectories, k].numpy().astype(float)
+        forces_n = act(kind.sideways(states, shifts_px))
+        return torch.from_numpy(forces_n / kind.force_limit_n).to(split.labels.dtype)
+
+    return labels
+
+
+def standardisation_sample(frames: Tensor, count: int = 512, *, frames_each: int = 2) -> Tensor:
+    """Return evenly spaced inputs [≤ ``count``, κ, H, W, 3] of frames [N, T + 1, H, W, 3]."""
+    length = frames.shape[1]
+    total = len(frames) * length
+    current = np.linspace(1, total - 1, min(count, total - 1)).astype(int)
+    rows, stored = np.divmod(current[current % length != 0], length)  # 0 has no predecessor
+    seen = torch.from_numpy(frames_seen(stored - 1, frames_each))
+    return frames[torch.from_numpy(rows)[:, None], seen]

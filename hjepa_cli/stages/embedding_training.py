@@ -1,0 +1,154 @@
+"""Training on frozen embeddings: what ``train-hierarchy`` and ``train-reflex`` share."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hjepa_cli.compute.device import resolve_device
+from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.drivers import build_driver
+from hjepa_cli.core.control.force_error import window_means
+from hjepa_cli.core.datasets.dataset import Dataset
+from hjepa_cli.core.evaluation.control_errors import control_errors
+from hjepa_cli.core.networks.model import Model, tensors_of
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.training.levels import EmbeddedTrajectories
+from hjepa_cli.core.training.optimiser import Optimiser, fit_actor
+from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.inputs import embed
+from hjepa_cli.stages.training import Architecture, Drawn, TrainingRun, untrained
+from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
+
+STREAM = 3  # of the shifts, and of train-hierarchy, in the seed tree
+REPORT_EVERY = 50  # steps between rows of metrics.csv
+
+
+def begin(
+    architecture: Architecture, trained: nn.ModuleDict, settings: Settings, *, taken: Sequence[str]
+) -> nn.ModuleDict:
+    """Return new networks, but for those ``taken`` from others; the encoder is frozen."""
+    torch.manual_seed(settings.seed)
+    modules = untrained(architecture, settings.plant)
+    for name in taken:
+        modules[name].load_state_dict(trained[name].state_dict())
+    modules["encoder"].requires_grad_(False).eval()
+    return modules.to(resolve_device(settings.device))
+
+
+def plan_embedding(settings: Settings, frames: int) -> tuple[str, dict[str, float]]:
+    """Return the line of a plan about all views of so many frames, and the amounts of work."""
+    views = len(views_of(settings, 0, flip=settings.encoder.mirror == "augment"))
+    line = f"render and encode about {frames} frames"
+    amounts: dict[str, float] = {"rendered frames": frames, "encoded frames": (1 + views) * frames}
+    return line + f", those for training {views} times" * (views > 1), amounts
+
+
+def embed_all(
+    encoder: nn.Module, train: RenderedSplit, settings: Settings, screen: Screen, *, flip: bool
+) -> list[tuple[EmbeddedTrajectories, Tensor]]:
+    """Return embeddings and labels [N, T, *A] of the training pictures and of shifted copies.
+
+    In a copy every trajectory is moved sideways by up to ``encoder.shift_px``, and the labels are
+    what the teacher does there. With ``flip`` all of these are there in the mirror too.
+    """
+    device, kind, count = resolve_device(settings.device), plant(settings.plant), len(train.frames)
+    mirror, teach = torch.tensor(kind.mirror), labels_of(train, kind)
+    every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
+    views = []
+    for mirrored, shifts_px in views_of(settings, count, flip=flip):
+        side = mirror if mirrored else torch.ones_like(mirror)
+        # A mirror image moved right is that of a picture moved left.
+        labels = side * teach(*every, (-shifts_px if mirrored else shifts_px)[:, None])
+        views.append((mirrored, shifts_px, side * train.actions, labels))
+    seen = []
+    with screen.progress("encode", len(views) * count, "trajectories") as bar:
+        for mirrored, shifts_px, actions, labels in views:
+            moved_px = shifts_px if shifts_px.any() else None
+            z = embed(
+                encoder, train, settings, mirrored=mirrored, shifts_px=moved_px, advance=bar.advance
+            )
+            seen.append((EmbeddedTrajectories(z.to(device), actions.to(device)), labels))
+    return seen
+
+
+def views_of(settings: Settings, count: int, *, flip: bool) -> list[tuple[bool, NDArray[np.int64]]]:
+    """Return the views of trajectories in training: as they are, shifted, and all in the mirror.
+
+    Each says whether it is mirrored, and how far right its ``count`` trajectories are [N], px.
+    """
+    farthest = settings.encoder.shift_px
+    copies = settings.hierarchy.shifted_copies if farthest else 0
+    drawn = generator(settings.seed, STREAM, 0).integers(-farthest, farthest + 1, (copies, count))
+    shifts = (np.zeros(count, dtype=np.int64), *drawn)
+    return [(mirrored, moved) for mirrored in (False, True)[: 1 + flip] for moved in shifts]
+
+
+def fit_network(
+    run: TrainingRun,
+    modules: nn.ModuleDict,
+    name: str,
+    optimiser: Optimiser,
+    stream: Generator,
+    draw: Callable[[], Drawn],
+) -> None:
+    """Train the one called ``name`` of a run's networks, as :meth:`TrainingRun.fit`."""
+
+    def report(step: int, loss: float) -> None:
+        if step % REPORT_EVERY == 0 or step == optimiser.steps:
+            run.record.metric({"level": name, "step": step, "loss": loss})
+
+    modules[name].train()
+    run.fit(name, optimiser, {"modules": modules}, stream, draw, report)
+    modules[name].eval()
+
+
+def fit_actor_to(
+    modules: nn.ModuleDict,
+    name: str,
+    z: Tensor,
+    labels: Tensor,
+    architecture: Architecture,
+    settings: Settings,
+) -> None:
+    """Fit an actor to labels [N, *A] of embeddings [N, D], in the architecture's size."""
+    hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
+    exact = architecture["mirror"] == "exact"
+    fitted = fit_actor(
+        z,
+        labels,
+        dataclasses.replace(settings.actor, hidden=hidden, dropout=dropout),
+        seed=settings.seed,
+        mirror=plant(settings.plant).force_signs if exact else None,
+    )
+    modules[name].load_state_dict(fitted.state_dict())
+    modules[name].eval()
+
+
+def save(run: TrainingRun, modules: nn.ModuleDict, metadata: dict[str, Any]) -> Model:
+    """Keep the checkpoint of a run, and return it as the model that drives."""
+    digest = save_checkpoint(run.record.path(MODEL_FILE), tensors_of(modules), metadata)
+    return Model(modules, metadata, digest, run.settings.device)
+
+
+def nmae_windows(model: Model, method: str, data: Dataset, settings: Settings) -> dict[str, float]:
+    """Return how far a method's forces are from the teacher's after one packet, by windows.
+
+    Both are on the clean rollouts; the error is ÷ the force range.
+    """
+    clean = data.split("clean")
+    errors = control_errors(
+        build_driver(method, settings, model),
+        clean.states.astype(float),
+        clean.teacher_n.astype(float),
+        model.force_limit_n,
+        min(settings.protocol.horizon, clean.steps - 1),
+    )
+    return {window: float(error.mean()) for window, error in window_means(errors).items()}

@@ -1,0 +1,259 @@
+"""Curves of closed loops for ``eval`` and ``scale``: what is cached, and what is measured now."""
+
+import os
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from hjepa_cli.config.checks import needs_model, split_late
+from hjepa_cli.config.schema import ProtocolSettings
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.loop import LOOP_VERSION
+from hjepa_cli.core.datasets.trajectories import generate
+from hjepa_cli.core.evaluation import curves
+from hjepa_cli.core.evaluation.bench import Bench
+from hjepa_cli.core.evaluation.curves import Entry
+from hjepa_cli.core.evaluation.entries import MethodEntries
+from hjepa_cli.core.evaluation.protocol import Point
+from hjepa_cli.core.evaluation.workers import open_workers
+from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.output.screen import Screen, ticking
+from hjepa_cli.stages.model_set import ModelSet, how_to_train
+from hjepa_cli.stages.plan import seconds_of
+from hjepa_cli.storage import runs
+from hjepa_cli.storage.runs import Run
+from hjepa_cli.storage.zoo import CURVES_FILE
+
+MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods
+USUAL_ROUNDS = 5  # of the search for tolerances, for the progress bar
+
+
+def plan_curves(
+    models: ModelSet, methods: Sequence[str], *, remeasure: bool
+) -> tuple[list[str], float]:
+    """Return what :func:`curves_for` would do, by lines, and about how many seconds it takes."""
+    protocol = models.settings.protocol
+    found = {} if remeasure else cached(models, methods)
+    known, missing = ([name for name in methods if (name in found) is had] for had in (True, False))
+    work = [f"take the cached curves of {', '.join(known)}"] if known else []
+    if missing:
+        work.append(
+            f"drive {protocol.curve_devices} devices for {protocol.total_steps} steps at each of "
+            f"{len(protocol.gaps)} gaps and as many delivery probabilities, "
+            f"{protocol.bracket_devices} near the limit, with {', '.join(missing)}"
+        )
+    return work, seconds_of_curves(missing, protocol)
+
+
+def seconds_of_curves(methods: Sequence[str], protocol: ProtocolSettings) -> float:
+    """Return about how long it takes to measure the curves of some methods."""
+    packets = 2 * protocol.curve_devices * protocol.total_steps * sum(1 / d for d in protocol.gaps)
+    frames = {"closed-loop frames": sum(map(needs_model, methods)) * packets}
+    return seconds_of_loops(methods, _usual_device_steps(protocol)) + seconds_of(frames)
+
+
+def seconds_of_loops(methods: Sequence[str], device_steps: float) -> float:
+    """Return about how long ``device_steps`` take, under each of the methods."""
+    embedded = sum(map(needs_model, methods))
+    on_states = (len(methods) - embedded) * device_steps
+    return seconds_of(
+        {
+            "device-steps on embeddings": embedded * device_steps,
+            "device-steps on states": on_states,
+        }
+    )
+
+
+def curves_for(
+    models: ModelSet,
+    screen: Screen,
+    record: Run,
+    *,
+    remeasure: bool = False,
+    methods: Sequence[str] | None = None,
+) -> dict[str, Any]:
+    """Take the curves of the settings' methods that are cached, measure the rest, keep each.
+
+    Every curve is kept under the digest of the model that it was measured with, in a file of that
+    model beside the checkpoint and in the run.
+
+    Args:
+        record: the run, of ``eval`` or ``scale``, that keeps them.
+        remeasure: do not use cached curves; those of this very run, interrupted, are kept.
+        methods: others than the settings', some perhaps late.
+
+    Returns:
+        The document of ``eval --json``. Methods without a model are left out, and said.
+    """
+    settings = models.settings
+    models.say_skipped(settings.methods, screen)
+    methods = models.measurable(settings.methods) if methods is None else methods
+    shares = [
+        _Share(one, names, record, remeasure=remeasure, first=one is models)
+        for one, names in models.shared_out(methods)
+    ]
+    jobs = [(name, share) for share in shares for name in share.missing]
+    jobs.sort(key=lambda job: methods.index(job[0]))
+    # Closed at once where an interruption comes in here: others are being measured meanwhile.
+    with closing(_measure(models, screen, jobs)) as measured:
+        for (name, share), entry in measured:
+            share.keep(name, entry)
+            record.event("measured", method=name)
+            screen.say(f"{name} measured")
+    found: dict[str, tuple[Entry, Path]] = {}
+    for share in shares:
+        share.finish()
+        found |= share.found
+    files = ", ".join(dict.fromkeys(str(found[name][1]) for name in methods))
+    paths = {name: models.of(name).path for name in methods if needs_model(name)}
+    return {
+        "checkpoint": models.path,
+        "checkpoints": {name: path for name, path in paths.items() if path},
+        "training_seeds": models.training_seeds(methods),
+        "plant": settings.plant,
+        "seed": settings.seed,
+        "loop_version": LOOP_VERSION,
+        "acceptable_score": settings.protocol.acceptable_score,
+        "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
+        "horizon": list(range(settings.protocol.horizon + 1)),
+        "methods": {name: found[name][0] for name in methods},
+        "skipped": models.skipped(settings.methods),
+        "curves": record.path(CURVES_FILE),
+        "source": f"curves of {files or 'nothing'}; --remeasure measures them again",
+    }
+
+
+class _Share:
+    """The methods that one set's own model holds, and where their curves are kept.
+
+    Attributes:
+        found: curves and the file that has them, so far.
+        missing: the methods that were not measured before.
+    """
+
+    def __init__(
+        self, models: ModelSet, methods: Sequence[str], record: Run, *, remeasure: bool, first: bool
+    ) -> None:
+        self.models, self._digest = models, models.digest
+        own = record.path(CURVES_FILE if first else curves.further_file(self._digest))
+        self.found = {} if remeasure else curves.find(self._digest, methods, models.beside)
+        kept: dict[str, Entry] = {}
+        try:
+            kept = curves.read(own, self._digest)
+        except DataError:
+            if not remeasure:  # which is what its hint says
+                raise
+        self.found |= {name: (kept[name], own) for name in methods if name in kept}
+        self.missing = [name for name in methods if name not in self.found]
+        # Beside the model too where that is a run of ours; the zoo is none.
+        self._own, self._files = (
+            own,
+            [own]
+            + [
+                path
+                for path in models.beside
+                if (path.parent / runs.CONFIG).is_file() and os.access(path.parent, os.W_OK)
+            ],
+        )
+
+    def keep(self, method: str, entry: Entry) -> None:
+        """Write what was measured, at once."""
+        for path in self._files:
+            curves.write(path, self._digest, {method: entry})
+        self.found[method] = (entry, self._own)
+
+    def finish(self) -> None:
+        """Let the run have the cached curves too."""
+        entries = {name: entry for name, (entry, _) in self.found.items()}
+        curves.write(self._own, self._digest, entries)
+
+
+def cached(models: ModelSet, methods: Sequence[str]) -> dict[str, tuple[Entry, Path]]:
+    """Return the curves of measurable methods that were measured before, and where they are."""
+    found: dict[str, tuple[Entry, Path]] = {}
+    for one, names in models.shared_out(methods):
+        found |= curves.find(one.digest, names, one.beside)
+    return found
+
+
+def measure_points(
+    models: ModelSet,
+    screen: Screen,
+    *,
+    method: str,
+    gaps: Sequence[float] = (),
+    probabilities: Sequence[float] = (),
+) -> list[dict[str, Any]]:
+    """Drive all bracket devices at given gaps (steps) or delivery probabilities, now.
+
+    Returns an entry per gap, then per probability, as in the curves of ``eval --json``. Raises
+    UsageError if the method cannot be measured.
+    """
+    settings, protocol = models.settings, models.settings.protocol
+    if split_late(method)[0] not in models.methods:
+        raise UsageError(
+            f"no model for method '{method}'; choose from {', '.join(models.methods)}",
+            hint=how_to_train(method, settings),
+        )
+    points = [Point("gap", gap) for gap in gaps]
+    points += [Point("delivery", 1 / p) for p in probabilities]
+    device_steps = _device_steps(protocol)
+    with (
+        open_workers(device_steps) as workers,
+        ticking(screen, f"verify {method}", (len(points) + 1) * device_steps) as tick,
+    ):
+        runner = workers.runner(settings, models.of(method).file)
+        bench = Bench(protocol, settings.seed, runner, tick)
+        outcome = bench.measure(method, points, protocol.bracket_devices)
+    return bench.reference.describe(points, outcome)
+
+
+_Job = tuple[str, _Share]
+"""A method to measure, and who has its model and keeps its entry."""
+
+
+def _measure(
+    models: ModelSet, screen: Screen, jobs: Sequence[_Job]
+) -> Generator[tuple[_Job, Entry], None, None]:
+    """Yield the entries of ``eval --json`` in the order in which they are ready."""
+    if not jobs:
+        return
+    settings, protocol = models.settings, models.settings.protocol
+    rollouts = _clean_rollouts(models)
+    with open_workers(_device_steps(protocol)) as workers:
+        with ticking(screen, "eval teacher", _device_steps(protocol)) as tick:
+            runner = workers.runner(settings, models.file)
+            bench = Bench(protocol, settings.seed, runner, tick)
+        if bench.teacher_score < MIN_TEACHER_SCORE:
+            screen.say(
+                f"the teacher itself scores only {bench.teacher_score:.2f} here (a sound protocol "
+                f"gives it {MIN_TEACHER_SCORE}): normalised scores say little"
+            )
+        label = f"eval {jobs[0][0]}" if len(jobs) == 1 else f"eval {len(jobs)} methods"
+        with ticking(screen, label, len(jobs) * _usual_device_steps(protocol)) as tick:
+            bench.tick = tick
+            measured = {
+                share: MethodEntries(
+                    bench, workers, share.models.settings, share.models.file, rollouts
+                )
+                for share in {share for _, share in jobs}
+            }
+            yield from workers.each(lambda job: measured[job[1]].entry(job[0]), jobs)
+
+
+def _clean_rollouts(models: ModelSet) -> tuple[Floats, Floats]:
+    """Return states [R, steps + 1, S] and teacher's forces [R, steps, *A] without exploration."""
+    clean = models.dataset.split("clean") if models.dataset else generate(models.settings, "clean")
+    return clean.states.astype("float64"), clean.teacher_n.astype("float64")
+
+
+def _device_steps(protocol: ProtocolSettings) -> int:
+    """Return the device-steps of one curve point with all devices."""
+    return protocol.total_steps * protocol.bracket_devices
+
+
+def _usual_device_steps(protocol: ProtocolSettings) -> int:
+    """Return the device-steps of one method: two grids, then rounds of two points."""
+    grids = 2 * len(protocol.gaps) * protocol.curve_devices * protocol.total_steps
+    return grids + 2 * USUAL_ROUNDS * _device_steps(protocol)

@@ -1,0 +1,57 @@
+"""The stages of the pipeline; each lies in a module of its own, imported when it runs."""
+
+from typing import Any
+
+from hjepa_cli.stages.stage import Imported, Stage
+
+
+def _stage(name: str, help: str, module: str, **more: Any) -> Stage:
+    """Return a stage whose functions ``run`` and ``plan`` lie in a module."""
+    run, plan = (Imported(f"hjepa_cli.stages.{module}:{call}") for call in ("run", "plan"))
+    return Stage(name, help, run, plan, **more)
+
+
+COLLECT = _stage(
+    "collect",
+    "Simulate cart-poles under an exploring teacher and store them as a dataset.",
+    "collect",
+    product="dataset",
+)
+TRAIN_ENCODER = _stage(
+    "train-encoder",
+    "Learn an encoder of camera frames by joint-embedding prediction, or train a baseline.",
+    "train_encoder",
+    inputs=("dataset",),
+    product="checkpoint",
+    shared=True,
+)
+TRAIN_HIERARCHY = _stage(
+    "train-hierarchy",
+    "Train the predictors of the hierarchy, the flat baseline and the semantic actor.",
+    "train_hierarchy",
+    inputs=("dataset", "encoder"),
+    product="checkpoint",
+)
+TRAIN_REFLEX = _stage(
+    "train-reflex",
+    "Train rivals of the predictors: what a packet and its age say, without predicting anything.",
+    "train_reflex",
+    inputs=("dataset", "checkpoint"),
+    product="checkpoint",
+)
+EVAL = _stage(
+    "eval",
+    "Measure prediction error, control score and tolerated losses of each method.",
+    "evaluate",
+    inputs=("checkpoint", "further", "dataset", "remeasure", "figure"),
+)
+SCALE = _stage(
+    "scale",
+    "Count the devices that one radio cell supports, by method and signal-to-noise ratio.",
+    "scale",
+    inputs=("checkpoint", "further", "dataset", "remeasure", "verify"),
+)
+REPRODUCE = _stage(
+    "reproduce", "Run all stages into one folder and write the report.", "reproduce",
+    product="report",
+)  # fmt: skip

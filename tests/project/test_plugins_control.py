@@ -1,0 +1,181 @@
+"""A codec, a closed-form method and a trained predictor from one file each, outside the package."""
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import block
+from test_evaluate import Output, elsewhere, quick_encoder, small, untrained
+
+from hjepa_cli import plugins
+from hjepa_cli.compute.executors import placed
+from hjepa_cli.config.checks import check_methods, check_payload
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.drivers import methods_of, planner_of
+from hjepa_cli.core.evaluation import curves
+from hjepa_cli.core.evaluation.bench import Bench
+from hjepa_cli.core.evaluation.curves import Digest
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.stages import evaluate, scale
+
+__all__ = ["elsewhere", "quick_encoder"]  # fixtures
+
+CODEC = block("plugins.md", "Codec(")
+
+CLOSED_FORM = block("plugins.md", "least-squares")
+
+PREDICTOR = block("plugins.md", "linear-step")
+
+
+@pytest.fixture(autouse=True)
+def no_plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Whatever a test loads is gone after it."""
+    for registry in (plugins.PLANTS, plugins.CODECS, plugins.METHODS):
+        monkeypatch.setattr(registry, "_added", {})
+    monkeypatch.setattr(plugins, "_sources", [])
+    before = set(sys.modules)
+    yield
+    for name in [name for name in set(sys.modules) - before if name.startswith("hjepa_plugin")]:
+        del sys.modules[name]
+
+
+def loaded(directory: Path, text: str, name: str = "mine.py") -> ModuleType:
+    """Write a plugin's file, load it as ``--plugin`` does, and return its module."""
+    directory.mkdir(exist_ok=True)
+    (directory / name).write_text(text)
+    source = plugins.load_file(directory / name)
+    return sys.modules[f"hjepa_plugin_{Path(name).stem}_{source.sha256[:8]}"]
+
+
+def tiny(methods: tuple[str, ...], **protocol: Any) -> Settings:
+    settings = small(methods=methods, **{"steps": 6, "horizon": 6} | protocol)
+    radio = dataclasses.replace(settings.radio, snr_db="20:30:10", law="duty")
+    collect = dataclasses.replace(settings.collect, trajectories=4, test_trajectories=2, steps=12)
+    return dataclasses.replace(settings, radio=radio, collect=collect)
+
+
+def run_both(settings: Settings, checkpoint: Path) -> dict[str, Any]:
+    """``eval``, then ``scale`` on its curves; returns the entries of ``eval``."""
+    measured = evaluate.run(settings, Output().screen, checkpoint=str(checkpoint))
+    counted = scale.run(settings, Output().screen, checkpoint=str(checkpoint))
+    assert {row["method"] for row in counted["rows"]} == set(settings.methods)
+    assert all(row["devices"] is not None or row["reason"] for row in counted["rows"])
+    entries: dict[str, Any] = measured["methods"]
+    assert all(np.isfinite(entry["nmae"]).all() for entry in entries.values())
+    return entries
+
+
+def test_a_codec(tmp_path: Path, quick_encoder: None) -> None:
+    checkpoint = untrained(tmp_path / "model.safetensors")
+    with pytest.raises(UsageError, match=r"unknown payload 'signs'; choose float32, .*pca-8x6$"):
+        check_payload("signs")
+    loaded(tmp_path, CODEC)
+    with pytest.raises(UsageError, match=r"like pca-8x6, or signs$"):
+        check_payload("sign")
+    entries = run_both(tiny(("hold", "hold-true"), payload="signs"), checkpoint)
+    assert {entry["bits_per_transmission"] for entry in entries.values()} == {256}
+
+
+def test_a_closed_form_method(tmp_path: Path, quick_encoder: None) -> None:
+    checkpoint = untrained(tmp_path / "model.safetensors")
+    loaded(tmp_path, CLOSED_FORM)
+    check_methods(("least-squares",))
+    entries = run_both(tiny(("least-squares", "hold")), checkpoint)
+    assert entries["least-squares"]["bits_per_transmission"] == 2064
+    assert entries["least-squares"]["nmae"] != entries["hold"]["nmae"]
+
+
+def test_a_trained_predictor(tmp_path: Path, quick_encoder: None) -> None:
+    base = untrained(tmp_path / "base" / "model.safetensors")
+    settings, own = tiny(("linear-step",)), tmp_path / "own" / "model.safetensors"
+    own.parent.mkdir()
+    plugin = loaded(tmp_path, PREDICTOR)
+    losses = plugin.train(base, own, settings)
+    assert losses[-1] < losses[0]
+    model = Model.load(own, "cpu")
+    assert methods_of(model) == ("linear-step",) and planner_of(model, "linear-step").stride == 1
+    assert "linear-step" not in methods_of(Model.load(base, "cpu"))
+    run_both(settings, own)
+    skipped = evaluate.run(tiny(("hold", "linear-step")), Output().screen, checkpoint=str(base))
+    assert "linear_step.train" in skipped["skipped"]["linear-step"]
+    # Without its plugin the file is data that nothing here can build.
+    plugins.METHODS._added.clear()
+    with pytest.raises(
+        DataError, match="no method builds networks of kind 'linear-step'"
+    ) as caught:
+        Model.load(own, "cpu")
+    assert "--plugin" in str(caught.value.hint)
+
+
+@pytest.mark.slow
+def test_worker_processes_have_the_plugins(tmp_path: Path) -> None:
+    base = untrained(tmp_path / "base" / "model.safetensors")
+    settings, own = tiny(("linear-step",), payload="signs"), tmp_path / "own" / "m.safetensors"
+    own.parent.mkdir()
+    loaded(tmp_path, CODEC, "codec.py")
+    loaded(tmp_path, PREDICTOR).train(base, own, settings)
+    here = evaluate.run(settings, Output().screen, checkpoint=str(own))
+    with placed(workers=1):
+        there = evaluate.run(settings, Output().screen, checkpoint=str(own), remeasure=True)
+    assert there["methods"] == here["methods"]
+
+
+def test_curves_expire_with_the_plugin_that_they_were_measured_with(
+    tmp_path: Path, quick_encoder: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = untrained(tmp_path / "model.safetensors")
+    loaded(tmp_path, CLOSED_FORM)
+    settings = tiny(("least-squares", "hold"))
+    evaluate.run(settings, Output().screen, checkpoint=str(checkpoint))
+    digest = Digest.of(Model.load(checkpoint).digest, settings)
+    [kept] = (tmp_path / "runs" / "eval").glob("*/curves.json")
+    assert set(curves.read(kept, digest)) == {"least-squares", "hold"}
+    loaded(tmp_path, CLOSED_FORM + "# changed\n")  # takes the place of what it was
+    assert set(curves.read(kept, digest)) == {"hold"}
+    measured = []
+    entry = Bench.entry
+    monkeypatch.setattr(
+        Bench, "entry", lambda self, method: measured.append(method.name) or entry(self, method)
+    )
+    evaluate.run(settings, Output().screen, checkpoint=str(checkpoint))
+    assert measured == ["least-squares"]
+
+
+def test_curves_expire_with_a_codec(tmp_path: Path) -> None:
+    built_in = Digest.of("model", tiny(("hold",)))
+    loaded(tmp_path, CODEC)
+    assert Digest.of("model", tiny(("hold",))) == built_in
+    first = Digest.of("model", tiny(("hold",), payload="signs"))
+    loaded(tmp_path, CODEC + "# changed\n")
+    assert Digest.of("model", tiny(("hold",), payload="signs")).protocol != first.protocol
+
+
+FAMILY = """
+import re
+from hjepa_cli.core.control.codecs.codec import Codec, CodecFamily
+from hjepa_cli.plugins import register
+
+def member(name):
+    found = re.fullmatch("keep-([0-9]+)", name)
+    return found and Codec(name, bits=lambda embedding: int(found[1]), fit=None)
+
+register(CodecFamily("keep-N", member, "keep-N for the first N values"))
+"""
+
+
+def test_a_family_s_members_come_from_their_names(tmp_path: Path) -> None:
+    loaded(tmp_path, FAMILY)
+    assert plugins.CODECS["keep-12"].bits(256) == 12 and "keep-N" not in plugins.CODECS
+    assert plugins.CODECS.source("keep-12") == plugins.in_force()[-1]
+    assert plugins.CODECS.source("int8") is None
+    with pytest.raises(UsageError, match=r"keep-N for the first N values$"):
+        check_payload("keep-")
+    taken = FAMILY.replace("keep-N", "pca-4x4")
+    with pytest.raises(UsageError, match="there is a codec called 'pca-4x4' already"):
+        loaded(tmp_path, taken, "other.py")
