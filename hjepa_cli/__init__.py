@@ -1,4 +1,4 @@
-"""hjepa: semantic predictive control over wireless links with a hierarchical JEPA.
+"""hjepa does semantic predictive control over wireless links with a hierarchical JEPA.
 
 The names in ``__all__`` are the public Python interface; each is imported when it is first used, so
 that ``import hjepa_cli`` costs nothing. Examples: docs/python.md.

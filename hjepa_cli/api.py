@@ -1,4 +1,4 @@
-"""The public Python interface: what the commands do, as functions that return plain objects.
+"""These functions do what the commands do, and return plain objects: the public interface.
 
 Errors are those of :mod:`hjepa_cli.errors`. Values of settings are given by their dotted names, as
 in a TOML file: ``settings={"protocol.steps": 200}``; ``hjepa config show`` lists them.
@@ -121,7 +121,7 @@ def drive(
     how = build_driver(method, chosen, model)
     seen: list[tuple[Floats, Floats]] = []
     outcome = simulate(
-        actual_plant(chosen),
+        actual_plant(chosen.plant, chosen.conditions),
         draws,
         (schedule if how.uses_link else np.ones_like(schedule))[None],
         how.controller(devices),
@@ -170,7 +170,8 @@ def simulate_cell(
     check_count("blocks", blocks)
     chosen = _settings(preset, None, settings)
     check_schedulable([method], chosen.protocol.total_steps)
-    kind, protocol, radio = actual_plant(chosen), chosen.protocol, chosen.radio
+    kind = actual_plant(chosen.plant, chosen.conditions)
+    protocol, radio = chosen.protocol, chosen.radio
     check_uplink(radio)
     how = build_driver(method, chosen, model)
     access = Access(

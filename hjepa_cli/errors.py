@@ -1,4 +1,4 @@
-"""Every error a user can cause or meet, with the exit code the shell sees.
+"""Users can cause or meet these errors, each with the exit code that the shell sees.
 
 An :class:`HjepaError` is printed as one line (what was wrong, where, the valid choices) plus an
 optional hint (the command to run next); it never shows a traceback. Codes follow sysexits.h.
@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 
 class HjepaError(Exception):
-    """Base of all expected errors; the hint says what to run or change next."""
+    """An expected error has a hint that says what to run or change next."""
 
     exit_code = 1
 
@@ -72,7 +72,7 @@ class Unsealed(UserWarning):
 
 
 class Interrupted(HjepaError):
-    """Ctrl-C or SIGTERM, whose code is 128 + the signal's number; nothing is lost."""
+    """Ctrl-C or SIGTERM has come: nothing is lost; the code is 128 + the signal's number."""
 
     def __init__(self, message: str, *, hint: str | None = None, code: int = 130) -> None:
         super().__init__(message, hint=hint)

@@ -1,4 +1,4 @@
-"""The cart-poles as Gymnasium environments, for other people's agents (extra ``gym``).
+"""Other people's agents get the cart-poles as Gymnasium environments (extra ``gym``).
 
 Importing this module registers ``hjepa/CartPole-v0`` (the agent sees the state) and
 ``hjepa/CartPolePixels-v0`` (it sees the camera). Starts, process noise and length are those of the
@@ -35,7 +35,7 @@ LOSSES = 0x1055  # this stream's branch of the seed tree
 
 
 class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One cart-pole; the observation is its state (x, x_dot, theta, theta_dot) in SI units.
+    """The observation is a cart-pole's state (x, x_dot, theta, theta_dot) in SI units.
 
     The action [1] in -1 … 1 is the force ÷ its limit, 20 N. ``info`` has ``state`` and ``score``,
     the share of control steps of this action inside the band |x| ≤ 0.05 m, |theta| ≤ 0.05 rad.
@@ -136,7 +136,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 class CartPolePixelsEnv(CartPoleEnv):
-    """The same cart-pole seen by the camera: frames uint8 [64, 128, 3].
+    """The camera sees the same cart-pole: observations are frames uint8 [64, 128, 3].
 
     One frame shows no velocity. ``gymnasium.wrappers.FrameStackObservation(env, 2)`` gives pairs
     uint8 [2, 64, 128, 3] (previous, current), which is what a model's encoder takes. The pair of
@@ -155,7 +155,7 @@ class CartPolePixelsEnv(CartPoleEnv):
 
 
 class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An uplink that loses observations: the agent then sees the last one that got through.
+    """This uplink loses observations: the agent then sees the last one that got through.
 
     The first observation of an episode always arrives. ``info`` has ``delivered`` and
     ``age_steps``, the actions since the observation was taken.

@@ -1,4 +1,4 @@
-"""Extensions by name: the package's own, those of installed packages, and of files of the user.
+"""Extensions have names: the package's own, those of installed packages, and of the user's files.
 
 Six kinds of things can be added without a change to the package: plants, codecs, schedulers,
 methods, sharing laws and stages. Each is one object, made with a class of the package, and has a
@@ -98,7 +98,7 @@ CLASSES = {  # what extensions are made with, those with families too
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Where extensions came from.
+    """Extensions came from here.
 
     Attributes:
         name: the path of a file as the user named it, or an installed package with its version.
@@ -117,7 +117,7 @@ class Source:
 
 
 class Registry:
-    """Extensions of one ``kind``: ``"plant"``, ``"codec"`` …, as in messages."""
+    """It finds extensions of one ``kind``: ``"plant"``, ``"codec"`` …, as in messages."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -239,7 +239,7 @@ def ensure(sources: Iterable[Source]) -> None:
 
 
 def in_force() -> tuple[Source, ...]:
-    """All that was loaded from outside of the package, in order."""
+    """Return all that was loaded from outside of the package, in order."""
     load_installed()
     return tuple(_sources)
 

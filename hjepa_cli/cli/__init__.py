@@ -1,1 +1,1 @@
-"""The command line: flags, help and what surrounds every command."""
+"""The command line has flags and help, and surrounds every command."""

@@ -1,4 +1,4 @@
-"""The entry of the program: errors become one line and an exit code, whatever the command.
+"""The program starts here: errors become one line and an exit code, whatever the command.
 
 Nothing heavy is imported here: a command imports its stage when it runs, so that ``--help`` answers
 at once.

@@ -1,4 +1,4 @@
-"""The program, built of the list of commands: signatures, and help with the defaults in force.
+"""The program is built of the list of commands, with signatures and the defaults in force in help.
 
 Imports nothing heavy; see :mod:`hjepa_cli.cli.commands`.
 """
@@ -30,7 +30,7 @@ VERSION: dict[str, Any] = {
 
 
 class ExplainedCommand(TyperCommand):
-    """A command whose help shows the defaults of the preset that is named beside ``--help``."""
+    """Its help shows the defaults of the preset that is named beside ``--help``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Remember the arguments: help is asked for before the others are read."""

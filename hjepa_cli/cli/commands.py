@@ -1,4 +1,4 @@
-"""The commands: what each takes, which stage does it, and what is particular about it.
+"""This list tells what each command takes, which stage does it, and what is particular about it.
 
 What a command does is imported when it runs, so that ``--help`` and refusals answer at once; the
 program is made of this list in :mod:`hjepa_cli.cli.builder`.
@@ -34,7 +34,7 @@ Given = dict[str, Any]  # what was given, by dotted key or argument; None: not g
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """One command.
+    """Describes a command.
 
     Attributes:
         name: as typed, with its group.

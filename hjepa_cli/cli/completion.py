@@ -1,4 +1,4 @@
-"""What the shell offers when TAB is pressed: names that lie on this disk, read without torch."""
+"""The shell offers names that lie on this disk when TAB is pressed, read without torch."""
 
 import contextlib
 from pathlib import Path

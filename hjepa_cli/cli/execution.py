@@ -1,4 +1,4 @@
-"""What every command does around its stage: plugins, settings, plan or result, interruptions.
+"""Every command does this around its stage: plugins, settings, plan or result, interruptions.
 
 Imports nothing heavy; see :mod:`hjepa_cli.cli.commands`.
 """
@@ -18,7 +18,7 @@ from hjepa_cli.output.screen import Screen
 
 
 class PipeClosed(HjepaError):
-    """Whoever read our output has gone, as in ``hjepa scale | head -1``: end without a word."""
+    """Whoever read our output has gone, as in ``hjepa scale | head -1``: we end without a word."""
 
     exit_code = StorageError.exit_code
 

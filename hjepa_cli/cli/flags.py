@@ -1,4 +1,4 @@
-"""Flags and arguments of the command line, as Typer takes them.
+"""These are flags and arguments of the command line, as Typer takes them.
 
 Those that override a setting follow from its declaration in :mod:`hjepa_cli.config.schema`; all
 others are declared here. A flag that is not given is ``None`` and changes nothing.
@@ -46,7 +46,7 @@ NAMES: Mapping[str, Iterable[str]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Input:
-    """One flag or argument of a command.
+    """Describes a flag or an argument of a command.
 
     Attributes:
         kind: its type, with bounds; a list of one may be repeated.

@@ -1,1 +1,1 @@
-"""What computing needs whatever is computed: seeds, processes, devices, interruptions."""
+"""All computing needs seeds, processes and devices, and may be interrupted."""

@@ -1,4 +1,4 @@
-"""Where networks compute, in which precision, and how they keep their memory."""
+"""Networks compute on a device, in some precision, and keep their memory."""
 
 import ctypes
 import sys

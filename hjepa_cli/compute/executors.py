@@ -1,4 +1,4 @@
-"""Where parallel work runs: in this process, in worker processes, or on a Dask cluster.
+"""Parallel work runs in this process, in worker processes, or on a Dask cluster.
 
 All three are a :class:`concurrent.futures.Executor`. What is submitted is plain data, decided by
 settings, seed and index alone, so that results do not depend on where or in which order it runs and

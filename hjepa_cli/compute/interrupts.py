@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: stop at the next safe point, then say how to go on.
+"""Ctrl-C and SIGTERM stop work at the next safe point; then a message says how to go on.
 
 Without anybody in the way they raise: :class:`KeyboardInterrupt` and its kind :class:`Terminated`.
 A loop that must not be cut postpones the first one and asks for it between its steps; a second one

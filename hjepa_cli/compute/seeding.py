@@ -1,4 +1,4 @@
-"""Random streams that depend on nothing but their name.
+"""Random streams depend on nothing but their name.
 
 Every consumer of randomness owns the stream ``(seed, stage, split, index, ...)``, so trajectory
 17 is the same whether 20 or 2,000 are made, in whatever order and on however many workers.

@@ -1,4 +1,4 @@
-"""What ``torchrun`` tells the processes that it starts; imports nothing heavy.
+"""``torchrun`` tells the processes that it starts who they are; this imports nothing heavy.
 
 Several processes train one encoder (:mod:`hjepa_cli.core.training.ranks`). The first leads: it
 alone prints and writes files.

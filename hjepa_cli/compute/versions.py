@@ -1,4 +1,4 @@
-"""Versions of what numbers depend on."""
+"""Numbers depend on these versions."""
 
 import importlib.metadata
 import platform

@@ -1,1 +1,1 @@
-"""Settings: what they are, where they come from, and which values make sense."""
+"""Settings are declared here, read from where they come from, and checked."""

@@ -1,4 +1,4 @@
-"""Rules that settings must meet before anything is read, written or imported.
+"""Settings must meet these rules before anything is read, written or imported.
 
 ``schema.py`` declares the type and the bounds of each value; here are the names, and what values
 must be to each other. Every message names the setting, what it is and what it may be.

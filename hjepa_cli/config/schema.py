@@ -1,4 +1,4 @@
-"""Every setting, declared once: its type, bounds, default, and the flag that overrides it.
+"""Every setting is declared once: its type, bounds, default, and the flag that overrides it.
 
 The command line builds its flags and their help from these declarations, and
 :mod:`hjepa_cli.config.settings` checks files and flags against them. Units are in the names. Where
@@ -30,7 +30,7 @@ BelowOne = Annotated[float, Meta(ge=0, lt=1)]
 
 @dataclasses.dataclass(frozen=True)
 class Flag:
-    """How the command line calls a value.
+    """The command line calls a value so.
 
     Attributes:
         name: ``"--steps"``, or ``"--gate/--no-gate"`` of a switch that has two.
@@ -50,7 +50,7 @@ STRIDE_H = Flag("--h", "Stride of the high level in control steps, a multiple of
 
 @dataclasses.dataclass(frozen=True)
 class CollectSettings:
-    """``collect``: how the dataset is made."""
+    """These settings say how ``collect`` makes the dataset."""
 
     trajectories: Annotated[Count, Flag("--trajectories", "Training trajectories.")] = 200
     test_trajectories: Annotated[Count, Flag("--test-trajectories", "Held-out trajectories.")] = 40
@@ -78,7 +78,7 @@ class CollectSettings:
 
 @dataclasses.dataclass(frozen=True)
 class EncoderSettings:
-    """``train-encoder``: the JEPA with its companion P^H, then the probe actor; or a baseline."""
+    """``train-encoder`` trains the JEPA with its P^H, then the probe actor; or a baseline."""
 
     method: Annotated[
         Literal["jepa", "supervised", "autoencoder"],
@@ -142,7 +142,7 @@ class EncoderSettings:
 
 @dataclasses.dataclass(frozen=True)
 class ActorSettings:
-    """The semantic actor, fitted by both training stages."""
+    """Both training stages fit the semantic actor."""
 
     hidden: Count = 1024
     dropout: BelowOne = 0.2
@@ -156,7 +156,7 @@ class ActorSettings:
 
 @dataclasses.dataclass(frozen=True)
 class HierarchySettings:
-    """``train-hierarchy``: P^H, P^M, P^L and ts-jepa-1 on frozen embeddings."""
+    """``train-hierarchy`` trains P^H, P^M, P^L and ts-jepa-1 on frozen embeddings."""
 
     h: Annotated[Count, STRIDE_H] = 4
     m: Annotated[Count, Flag("--m", "Stride of the medium level, a multiple of l.")] = 2
@@ -185,7 +185,7 @@ class HierarchySettings:
 
 @dataclasses.dataclass(frozen=True)
 class ReflexSettings:
-    """``train-reflex``: what answers a packet by its age, and the search for decaying holds."""
+    """``train-reflex`` trains answers to a packet by its age, and searches for decaying holds."""
 
     forces_at_once: Count = 4  # of the chunk; as many as P^H plans
     steps: Count = 1600
@@ -205,7 +205,7 @@ class ReflexSettings:
 
 @dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
-    """``eval`` and ``scale``: the closed-loop protocol."""
+    """``eval`` and ``scale`` follow this closed-loop protocol."""
 
     warmup_steps: CountOrNone = 1000  # not scored: they remember the start
     steps: Count = 3000  # scored
@@ -270,7 +270,7 @@ PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
 
 @dataclasses.dataclass(frozen=True)
 class ConditionSettings:
-    """``eval`` and ``scale``: how devices differ from those that models were trained on.
+    """Devices of ``eval`` and ``scale`` may differ so from those that models were trained on.
 
     Beside ``protocol.plant_spread``; controllers do not know.
     """
@@ -282,7 +282,7 @@ class ConditionSettings:
 
 @dataclasses.dataclass(frozen=True)
 class RadioSettings:
-    """``scale``: the radio cell."""
+    """``scale`` counts devices in this radio cell."""
 
     law: Annotated[
         str,
@@ -374,7 +374,7 @@ class RadioSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Everything that defines a run besides the paths it reads and writes."""
+    """All of these define a run, besides the paths it reads and writes."""
 
     preset: str = "default"
     plant: Annotated[str, Flag("--plant", "What to control.")] = "desktop"

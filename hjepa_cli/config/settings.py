@@ -1,4 +1,4 @@
-"""Settings from their layers: declared defaults < preset < protocol < ``--config`` < flags.
+"""Settings come in layers: declared defaults < preset < protocol < ``--config`` < flags.
 
 The defaults are those of :mod:`hjepa_cli.config.schema`; presets (TOML files in ``presets/``),
 ``--config FILE.toml`` and flags override single values.
@@ -30,7 +30,7 @@ PROTOCOLS = ("steady", "paper")  # scored after a warm-up, or from the start on 
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """Values of one source: a preset, a protocol, a file (then with its ``text``), or a flag."""
+    """A source has values: a preset, a protocol, a file (then with its ``text``), or a flag."""
 
     source: str
     values: dict[str, Any]

@@ -1,1 +1,1 @@
-"""The shared core: plant, camera, models, channel, control loop and metrics; one idea per file."""
+"""The core holds plants, networks, radio, control loop and metrics; one idea per file."""

@@ -1,1 +1,1 @@
-"""What people see: the screen, tables, figures, films and the report."""
+"""People see the screen, tables, figures and films."""

@@ -1,4 +1,4 @@
-"""Animations of closed loops: pictures of all devices, as GIF or MP4.
+"""Animations show closed loops in pictures of all devices, as GIF or MP4.
 
 One row per method, one panel per device: the camera's picture of the true cart-pole, over it the
 pole that the controller believes in (dashed, black), the age of its last packet and the SNR, and a
@@ -36,7 +36,7 @@ MOST_GIF_FPS = 50  # viewers take a single hundredth of a second for ten
 
 
 class Pictures:
-    """The pictures of an animation, drawn when asked for.
+    """It draws the pictures of an animation when asked for them.
 
     Args:
         films: one per method, of the same devices and steps.

@@ -1,4 +1,4 @@
-"""Figures for papers: one column wide or two, readable in black and white, equal byte for byte.
+"""Figures are for papers: a column wide or two, readable in black and white, equal byte for byte.
 
 This is the only module that imports matplotlib (extra ``plot``). Figures are built without pyplot,
 so no display, backend or global state is involved.

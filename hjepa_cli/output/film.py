@@ -1,4 +1,4 @@
-"""What happened to devices over a while, ready to be drawn."""
+"""A film holds what happened to devices over a while, ready to be drawn."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ from hjepa_cli.core.arrays import Bools, Floats
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """What the radio does to n devices over K steps."""
+    """The radio does this to n devices over K steps."""
 
     delivered: Bools  # which packets arrive [K, n]
     snr_db: Floats  # received, in each slot [K, n]
@@ -17,7 +17,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Film:
-    """What happened to the devices of one method."""
+    """This happened to the devices of one method."""
 
     method: str
     states: Floats  # true [K, n, S]

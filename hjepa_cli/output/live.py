@@ -1,7 +1,7 @@
-"""Animations of closed loops in the terminal: pictures of two pixels a character, with rich.
+"""The terminal shows closed loops in pictures of two pixels a character, with rich.
 
-What :mod:`hjepa_cli.output.animation` draws, coarser: the true plant in its colours, over it the
-pole that the controller believes in (black), and a strip with one character per picture.
+They show what :mod:`hjepa_cli.output.animation` draws, coarser: the true plant in its colours, over
+it the pole that the controller believes in (black), and a strip with a character per picture.
 """
 
 import time

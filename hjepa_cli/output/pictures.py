@@ -1,4 +1,4 @@
-"""Pictures made of camera frames: contact sheets and animations, with Pillow (extra ``plot``)."""
+"""Camera frames become contact sheets and animations, with Pillow (extra ``plot``)."""
 
 import io
 from collections.abc import Sequence

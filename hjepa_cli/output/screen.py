@@ -1,4 +1,4 @@
-"""What the user sees: notes, tables, progress, and the one JSON document of ``--json``.
+"""The user sees notes, tables, progress, and the one JSON document of ``--json``.
 
 Results (tables, result lines, JSON) go to stdout; everything about the work (notes, progress,
 errors) goes to stderr. Under ``json`` stdout carries the JSON document alone. Texts are printed as
@@ -29,14 +29,14 @@ GAP = 2  # blanks between columns
 
 
 class Advance:
-    """Progress that nobody sees; :meth:`Screen.progress` shows a bar or lines."""
+    """Nobody sees this progress; :meth:`Screen.progress` shows a bar or lines."""
 
     def advance(self, count: int = 1, **fields: float) -> None:
         """Count ``count`` more units; ``fields`` (``loss=0.1``) are shown beside them."""
 
 
 class Screen:
-    """The only way this program writes to the terminal.
+    """This program writes to the terminal in no other way.
 
     Args:
         quiet: show results and errors only.
@@ -164,7 +164,7 @@ def ticking(screen: Screen, label: str, total: int) -> Iterator[Callable[[int], 
 
 
 class _Count(Advance):
-    """How many units are done, at which rate since this process began."""
+    """It counts units that are done, and their rate since this process began."""
 
     def __init__(self, total: int, unit: str, done: int) -> None:
         self._total, self._unit = total, unit
@@ -198,7 +198,7 @@ class _Count(Advance):
 
 
 class _Bar(_Count):
-    """One line of the live display."""
+    """It is a line of the live display."""
 
     def __init__(self, bars: "RichProgress", label: str, total: int, unit: str, done: int) -> None:
         super().__init__(total, unit, done)
@@ -222,7 +222,7 @@ class _Bar(_Count):
 
 
 class _Heartbeat(_Count):
-    """Lines for log files: one every :data:`HEARTBEAT_S` and one at the end."""
+    """It prints lines for log files, one every :data:`HEARTBEAT_S` and one at the end."""
 
     def __init__(self, stream: TextIO, label: str, total: int, unit: str, done: int) -> None:
         super().__init__(total, unit, done)

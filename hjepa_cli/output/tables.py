@@ -1,4 +1,4 @@
-"""Tables of what a training stage or an evaluation found."""
+"""Tables show what a training stage or an evaluation found."""
 
 from typing import Any
 

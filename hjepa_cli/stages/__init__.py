@@ -1,1 +1,1 @@
-"""One module per subcommand; each reads top-down as the story of its stage."""
+"""Each subcommand has a module, which reads top-down as the story of its stage."""

@@ -1,4 +1,4 @@
-"""``hjepa train-encoder --method supervised|autoencoder``: the baselines on raw frames.
+"""``hjepa train-encoder --method supervised|autoencoder`` trains the baselines on raw frames.
 
 They see the windows that the JEPA sees, in the same steps of the same optimiser: the supervised
 network in one loop, the auto-encoder in two, first to reconstruct, then to act on what it

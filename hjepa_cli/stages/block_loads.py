@@ -38,7 +38,8 @@ class BlockLoads:
         self._models, self._screen, self._workers = models, screen, workers
         self._settings = models.settings
         radio, protocol = self._settings.radio, self._settings.protocol
-        cell = Cell.of(radio, actual_plant(self._settings))
+        kind = actual_plant(self._settings.plant, self._settings.conditions)
+        cell = Cell.of(radio, kind)
         self._band = ScheduledBand(cell, radio, protocol.acceptable_score)
         self._seeds = range(self._settings.seed, self._settings.seed + radio.seeds)
         self._load_steps = BLOCK_DEVICES * protocol.total_steps  # device-steps of a load, about

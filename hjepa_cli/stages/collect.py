@@ -1,4 +1,4 @@
-"""``hjepa collect``: simulate cart-poles under an exploring teacher and keep them as a dataset.
+"""``hjepa collect`` simulates plants under an exploring teacher and keeps them as a dataset.
 
 Settings → dataset directory. Frames are stored only with ``--frames stored``, because states are
 1,500 times smaller and render to the same pixels every time; otherwise a sample is rendered, to
@@ -109,7 +109,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
 
 def plan(settings: Settings, *, out: Path | None = None) -> Plan:
     """Plan the simulation of all splits and, if frames are stored, their pictures."""
-    options, sizes = settings.collect, split_sizes(settings).values()
+    options, sizes = settings.collect, split_sizes(settings.collect).values()
     steps = sum(count * steps for count, steps in sizes)
     frames = steps + sum(count for count, _ in sizes) if options.frames == "stored" else 0
     work = [
@@ -196,7 +196,7 @@ def recorded_settings(directory: Path) -> Settings:
 def check(settings: Settings) -> None:
     """Raise UsageError where sizes make no dataset, naming the setting."""
     check_settings(settings)
-    total = sum(count for count, _ in split_sizes(settings).values())
+    total = sum(count for count, _ in split_sizes(settings.collect).values())
     most = MAX_SHARDS * per_shard(settings.collect.frames == "stored")
     if total > most:
         raise UsageError(
@@ -207,7 +207,7 @@ def check(settings: Settings) -> None:
 
 def shards_of(settings: Settings) -> list[Shard]:
     """Return the shards that the settings make."""
-    sizes = {name: count for name, (count, _) in split_sizes(settings).items()}
+    sizes = {name: count for name, (count, _) in split_sizes(settings.collect).items()}
     return cut(sizes, per_shard(settings.collect.frames == "stored"))
 
 
@@ -216,9 +216,10 @@ def make_shards(
 ) -> list[Described]:
     """Simulate, and render if frames are stored, every shard that is not there yet."""
     shards, stored = shards_of(settings), settings.collect.frames == "stored"
+    sizes = split_sizes(settings.collect)
 
     def is_done(shard: Shard) -> bool:
-        count, (_, steps) = shard.stop - shard.start, split_sizes(settings)[shard.split]
+        count, (_, steps) = shard.stop - shard.start, sizes[shard.split]
         ours = {"split": shard.split, "trajectories": count, "steps": steps, "stored": stored}
         return ours.items() <= log.done.get(shard.name, {}).items()
 
@@ -228,7 +229,7 @@ def make_shards(
         f"collecting trajectories of plant {settings.plant}: {len(left)} of {len(shards)} shards"
     )
     make = functools.partial(make_shard, settings, directory)
-    enough = sum(count * steps for count, steps in split_sizes(settings).values()) >= WORTH_WORKERS
+    enough = sum(count * steps for count, steps in sizes.values()) >= WORTH_WORKERS
     with (
         screen.progress("collect", total, "trajectories", done=total - to_do) as bar,
         open_executor(min(cores(), MAX_WORKERS, len(left)) if enough else 0) as (executor, workers),
@@ -256,7 +257,7 @@ def size_bytes(settings: Settings) -> int:
     frame_bytes = HEIGHT_PX * WIDTH_PX * 3 * (settings.collect.frames == "stored")
     return sum(
         count * ((steps + 1) * (state_bytes + frame_bytes) + force_bytes * steps)
-        for count, steps in split_sizes(settings).values()
+        for count, steps in split_sizes(settings.collect).values()
     )
 
 

@@ -1,4 +1,4 @@
-"""``hjepa compare RUN…``: evaluations of several trainings as one table and one figure.
+"""``hjepa compare RUN…`` shows evaluations of several trainings in one table and one figure.
 
 Runs of ``eval`` whose models were trained with different seeds → per method the mean over
 trainings with Student's 95 % interval, and the first method against every other one, paired
@@ -43,7 +43,7 @@ ByMethod = dict[str, dict[int, Entry]]
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """A finished run of ``eval`` whose models, if it has any, come from one training seed."""
+    """It is a finished run of ``eval``; its models, if any, come from one training seed."""
 
     directory: Path
     result: Mapping[str, Any]
@@ -70,7 +70,7 @@ class Evaluation:
 
 
 class _Result(msgspec.Struct):
-    """All of a result of ``eval`` that a comparison relies on."""
+    """A comparison relies on this much of a result of ``eval``."""
 
     plant: str
     loop_version: int

@@ -1,4 +1,4 @@
-"""``hjepa data info | verify | preview | export``: what a dataset is, and whether it is intact."""
+"""``hjepa data info | verify | preview | export`` tells what a dataset is, and if it is intact."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Training on frozen embeddings: what ``train-hierarchy`` and ``train-reflex`` share."""
+"""``train-hierarchy`` and ``train-reflex`` share their training on frozen embeddings."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""``hjepa eval``: prediction error, control score and tolerated losses of each method.
+"""``hjepa eval`` measures each method's prediction error, control score and tolerated losses.
 
 A trained model (a run's or the zoo's) → closed-loop curves of every method, kept under a digest of
 all they depend on, and tables. ``scale`` takes the same curves (:mod:`hjepa_cli.stages.measuring`).

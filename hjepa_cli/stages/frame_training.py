@@ -1,4 +1,4 @@
-"""Training on camera frames: the loop that all methods of ``train-encoder`` share."""
+"""All methods of ``train-encoder`` share the loop that trains on camera frames."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Frames and embeddings of a dataset, as training reads them."""
+"""Training reads frames and embeddings of a dataset here."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -103,7 +103,7 @@ def render(
                 bar.advance(len(chunk))
         frames = np.concatenate(parts)
     return RenderedSplit(
-        frames=torch.from_numpy(vary(frames, settings, split)),
+        frames=torch.from_numpy(vary(frames, settings.encoder, settings.seed, split)),
         states=torch.from_numpy(trajectories.states[:, 1:].copy()),
         actions=torch.from_numpy(trajectories.applied_n / limit_n),
         labels=torch.from_numpy(trajectories.teacher_n / limit_n),
@@ -112,7 +112,7 @@ def render(
 
 def count_frames(data: Dataset | None, settings: Settings, *splits: str) -> int:
     """Return the frames of splits; of no dataset, those that the settings would collect."""
-    sizes = split_sizes(settings)
+    sizes = split_sizes(settings.collect)
     if data:
         sizes = {name: (of["trajectories"], of["steps"]) for name, of in data.splits.items()}
     return sum(count * (steps + 1) for count, steps in (sizes[name] for name in splits))

@@ -1,4 +1,4 @@
-"""Curves of closed loops for ``eval`` and ``scale``: what is cached, and what is measured now."""
+"""``eval`` and ``scale`` take curves of closed loops from a cache, or measure them now."""
 
 import os
 from collections.abc import Generator, Sequence
@@ -125,7 +125,7 @@ def curves_for(
 
 
 class _Share:
-    """The methods that one set's own model holds, and where their curves are kept.
+    """It has the methods that one set's own model holds, and knows where their curves are kept.
 
     Attributes:
         found: curves and the file that has them, so far.

@@ -1,4 +1,4 @@
-"""The models that ``eval`` and ``scale`` measure: one for each method, found wherever it is.
+"""``eval`` and ``scale`` measure a model for each method, found wherever it is.
 
 The model that the user names, or the newest run's, or the zoo's, comes first. A method that it does
 not hold is looked for in the other runs of the plant, newest first, and in the zoo.
@@ -32,7 +32,7 @@ TRAINING = ("train-encoder", "train-hierarchy", "train-reflex")
 
 @dataclasses.dataclass(frozen=True)
 class ModelSet:
-    """A model to be evaluated, if there is one, those beside it, and the rollouts of its NMAE.
+    """It holds a model to be evaluated, if any, those beside it, and the rollouts of its NMAE.
 
     Attributes:
         model: ``None`` when only true-state methods can be measured; ``path`` is its file.

@@ -1,4 +1,4 @@
-"""``hjepa models list | info | verify``: what a trained model is, and whether it is intact."""
+"""``hjepa models list | info | verify`` tells what a trained model is, and if it is intact."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The stages of the pipeline; each lies in a module of its own, imported when it runs."""
+"""Each stage of the pipeline lies in a module of its own, imported when it runs."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""``--dry-run``: what a command would read, do and write, and about how long it would take.
+"""``--dry-run`` tells what a command would read, do and write, and about how long it would take.
 
 Each stage has a function ``plan`` beside its ``run``, which counts what ``run`` would compute; here
 is what they share. Times come from rates measured on two cores, so elsewhere they are right within
@@ -32,7 +32,7 @@ RATES_PER_S = {  # two cores of a server CPU
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A plan of one command: what it reads, does and writes in lines, ``seconds`` on two cores."""
+    """It says in lines what a command reads, does and writes, taking ``seconds`` on two cores."""
 
     command: str
     reads: list[str]

@@ -1,4 +1,4 @@
-"""``hjepa report RUN…``: what some runs found, in one HTML file that needs nothing else.
+"""``hjepa report RUN…`` tells what some runs found, in one HTML file that needs nothing else.
 
 Run directories → per run its result with intervals, its figures, its settings, its environment and
 the commands that make it again. Figures can also be written as files for a paper.

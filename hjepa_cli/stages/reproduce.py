@@ -1,4 +1,4 @@
-"""``hjepa reproduce``: all five stages into one folder, then the report.
+"""``hjepa reproduce`` runs all five stages into one folder, then the report.
 
 Settings → ``runs/reproduce/<nnnn>/`` with the dataset, one run per stage and ``report.html``. Each
 stage reads what the one before it left in the folder and nothing else; the same command with

@@ -1,4 +1,4 @@
-"""``hjepa resume RUN``: take up an interrupted run with nothing but its directory.
+"""``hjepa resume RUN`` takes up an interrupted run with nothing but its directory.
 
 The run remembers its settings (``config.toml``) and what it was given (``environment.json``).
 """

@@ -1,4 +1,4 @@
-"""``hjepa config show``: every value that a command would use, and where it comes from."""
+"""``hjepa config show`` tells every value that a command would use, and where it comes from."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""A stage: one step of the pipeline, as the command line, Python and ``hjepa resume`` call it.
+"""A stage is a step of the pipeline, as the command line, Python and ``hjepa resume`` call it.
 
 Nothing heavy is imported here: a stage says what it is called and what it takes before the module
 that does its work is imported.
@@ -14,7 +14,7 @@ from hjepa_cli.stages.plan import Plan
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A step of the pipeline with a command and, but for ``collect``, run directories of its own.
+    """A stage has a command and, but for ``collect``, run directories of its own.
 
     Attributes:
         name: of the command and of ``runs/<name>/``.
@@ -40,7 +40,7 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Imported:
-    """The function at ``"module:function"``, imported when it is called."""
+    """The function at ``"module:function"`` is imported when it is called."""
 
     place: str
 

@@ -1,4 +1,4 @@
-"""``hjepa train-encoder``: learn Ψ and its companion P^H from rendered frames, or a baseline.
+"""``hjepa train-encoder`` learns Ψ and its companion P^H from rendered frames, or a baseline.
 
 Dataset → checkpoint. The story: render the trajectories once, train on whole sub-sampled
 trajectories, look at the representation's health every epoch, and let the stage gates decide

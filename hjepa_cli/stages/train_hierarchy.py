@@ -1,6 +1,6 @@
-"""``hjepa train-hierarchy --h 4 --m 2 --l 1``: P^H, P^M, P^L, ts-jepa-1 and the semantic actor.
+"""``hjepa train-hierarchy --h 4 --m 2 --l 1`` trains P^H, P^M, P^L, ts-jepa-1 and the actor.
 
-``--h 4`` alone: one level of that stride, ts-jepa-1 and the actor.
+``--h 4`` alone trains one level of that stride, ts-jepa-1 and the actor.
 
 Dataset + encoder checkpoint → one checkpoint with everything inference needs. The encoder is
 frozen: every frame is encoded once, and all that follows are small networks on embeddings.

@@ -1,4 +1,4 @@
-"""``hjepa train-reflex``: rivals of the predictors that predict nothing.
+"""``hjepa train-reflex`` trains rivals of the predictors, which predict nothing.
 
 Dataset + trained model → one checkpoint of its encoder and actor, both frozen, with four ways to
 turn the last packet and its age into a force: the actor's force that fades, that of a law made for

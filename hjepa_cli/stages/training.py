@@ -1,4 +1,4 @@
-"""The frame around every training stage: its dataset, its run directory, its loops, its checkpoint.
+"""Every training stage has a dataset, a run directory, loops and a checkpoint.
 
 Whatever is trained, a stage opens a dataset and perhaps a model that it builds on, takes up its run
 where that was interrupted, renders both splits, runs its loops, and keeps one checkpoint with a
@@ -45,7 +45,7 @@ Drawn = tuple[Tensor, Callable[[], str]]
 
 @dataclasses.dataclass(frozen=True)
 class TrainingRun:
-    """An open run of the training stage ``stage``, in the directory of ``record``."""
+    """A run of the training stage ``stage`` is open, in the directory of ``record``."""
 
     stage: str
     settings: Settings

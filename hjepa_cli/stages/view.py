@@ -1,4 +1,4 @@
-"""``hjepa view``: watch closed loops over a fading link, and what the controller believes.
+"""``hjepa view`` shows closed loops over a fading link, and what the controller believes.
 
 Model → a few devices per method on the same draws and the same fading → an animation: the true
 pole, the pole that a linear probe reads from the controller's current embedding, every packet, the
@@ -38,7 +38,7 @@ PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encod
 
 
 class Believer:
-    """A controller of n devices whose belief is read, by a linear probe, at every step."""
+    """A linear probe reads, at every step, what a controller of n devices believes."""
 
     def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
         self._controller, self._probe = controller, probe
@@ -113,8 +113,9 @@ def run(
     probe = fit_probe(settings, models.model, screen)
     films = [film(name, settings, models.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.total_steps // 100, 1)
-    kind = actual_plant(settings)
-    pictures = animation.Pictures(films, link, kind, actual_camera(settings), every)
+    kind = actual_plant(settings.plant, settings.conditions)
+    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    pictures = animation.Pictures(films, link, kind, camera, every)
     result = {
         "checkpoint": models.path,
         "methods": {
@@ -235,7 +236,7 @@ def film(
     name: str, settings: Settings, model: Model, link: Link, probe: torch.Tensor, screen: Screen
 ) -> Film:
     """Drive the devices with one method and keep every state and belief."""
-    kind = actual_plant(settings)
+    kind = actual_plant(settings.plant, settings.conditions)
     method = build_driver(name, settings, model)
     steps, devices = link.delivered.shape
     believer = Believer(method.controller(devices), probe)

@@ -1,1 +1,1 @@
-"""What lies on disk: datasets, checkpoints, run directories, the model zoo."""
+"""Datasets, checkpoints, run directories and the model zoo lie on disk."""

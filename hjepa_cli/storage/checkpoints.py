@@ -1,4 +1,4 @@
-"""Checkpoints: named tensors plus everything needed to use them, sealed by a digest.
+"""A checkpoint has named tensors and everything needed to use them, sealed by a digest.
 
 One safetensors file; its single metadata key holds canonical JSON with the schema version, the
 digest and whatever the writer describes (architecture, normalisation, seed, health). Nothing in

@@ -1,4 +1,4 @@
-"""One way to put files on disk: complete and durable, or not at all.
+"""Files are put on disk complete and durable, or not at all.
 
 A file is written under a temporary name beside its target, flushed to the disk and then renamed,
 so a crash, a kill or a full disk leaves either the old file or the new one. The same directory

@@ -1,4 +1,4 @@
-"""Run directories: what a stage was asked, what happened, and the result, written last.
+"""A run directory says what a stage was asked, what happened, and the result, written last.
 
 ``runs/<stage>/<nnnn>/`` holds ``config.toml`` (fully resolved, usable with ``--config``),
 ``environment.json`` (stage, versions, plugins, command, inputs), ``metrics.csv`` (no time, host or

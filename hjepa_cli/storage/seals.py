@@ -1,4 +1,4 @@
-"""Seals: a file that carries the sha256 of its own content, so that no change goes unnoticed.
+"""A sealed file carries the sha256 of its own content, so that no change goes unnoticed.
 
 A seal shows that nothing was changed since it was written, not who wrote it.
 """

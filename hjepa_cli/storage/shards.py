@@ -1,4 +1,4 @@
-"""A dataset in the making: shards that are done, so that a collection is taken up after a stop.
+"""A dataset in the making has shards that are done, so that collecting goes on after a stop.
 
 ``collecting.jsonl`` lies beside the shards until ``dataset.json`` replaces it. Its first line says
 what is collected, each other line describes a finished shard. A shard counts only if it is the

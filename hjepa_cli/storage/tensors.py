@@ -1,4 +1,4 @@
-"""Named numpy arrays to safetensors bytes and back, without the library's traps.
+"""Named numpy arrays become safetensors bytes and back, without the library's traps.
 
 safetensors 0.8 silently scrambles arrays that are not C-contiguous, and more than one metadata
 key makes the bytes random. All array files of this program therefore pass through here.

@@ -1,4 +1,4 @@
-"""Optional copies of a run's metrics for other people's dashboards; off unless asked for.
+"""Other people's dashboards get copies of a run's metrics, if asked for.
 
 ``HJEPA_LOG=tensorboard`` writes TensorBoard event files into the run directory as it trains.
 Nothing leaves the machine, and no account is asked for. ``metrics.csv`` is written in any case.

@@ -1,4 +1,4 @@
-"""The model zoo: trained models shipped with the program, found by name.
+"""The model zoo has trained models, shipped with the program and found by name.
 
 ``models/<name>/`` holds ``model.safetensors``, ``curves.json`` (its measured closed-loop curves)
 and ``README.md`` (its card). The wheel carries the folder as ``hjepa_cli/zoo``; a checkout and an

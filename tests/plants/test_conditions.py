@@ -16,6 +16,7 @@ from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
 from hjepa_cli.core.plants.conditions import Disturbed, actual_camera, actual_plant, vary
 from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import collect
@@ -31,35 +32,43 @@ def settings(preset: str = "default", seed: int = 0, **conditions: float) -> Set
     return load_settings(preset, flags={"seed": seed, **changes})
 
 
+def devices(options: Settings) -> System:
+    return actual_plant(options.plant, options.conditions)
+
+
+def camera(options: Settings) -> Camera:
+    return actual_camera(options.plant, options.conditions, options.seed)
+
+
 def test_nominal_conditions_change_nothing() -> None:
-    assert actual_plant(settings()) is plant("desktop")
-    assert not isinstance(actual_camera(settings()), Disturbed)
+    assert devices(settings()) is plant("desktop")
+    assert not isinstance(camera(settings()), Disturbed)
 
 
 def test_light_scales_what_the_camera_sees() -> None:
     nominal = plant("desktop").camera().render(STATES).astype(float)
     for light in (0.5, 1.3):
-        seen = actual_camera(settings(light=light)).render(STATES)
+        seen = camera(settings(light=light)).render(STATES)
         assert np.abs(seen - np.clip(light * nominal, 0, 255)).max() <= 0.501
 
 
 def test_noise_is_as_wide_as_it_says_and_the_same_for_the_same_states() -> None:
-    camera = actual_camera(settings(light=0.5, camera_noise=4.0))
+    noisy = camera(settings(light=0.5, camera_noise=4.0))
     nominal = 0.5 * plant("desktop").camera().render(STATES).astype(float)
-    seen = camera.render(STATES)
+    seen = noisy.render(STATES)
     errors = (seen - nominal)[nominal > 30]
     # Rounding adds 1/12; a standard deviation from n values is good to σ / √(2n).
     width = np.sqrt(4.0**2 + 1 / 12)
     assert abs(errors.std() - width) < 4 * width / np.sqrt(2 * errors.size)
     assert abs(errors.mean()) < 4 * width / np.sqrt(errors.size)
-    assert (actual_camera(settings(light=0.5, camera_noise=4.0)).render(STATES) == seen).all()
-    assert (camera.render(STATES + 1e-9) != seen).any()
-    other = actual_camera(settings(seed=1, light=0.5, camera_noise=4.0))
+    assert (camera(settings(light=0.5, camera_noise=4.0)).render(STATES) == seen).all()
+    assert (noisy.render(STATES + 1e-9) != seen).any()
+    other = camera(settings(seed=1, light=0.5, camera_noise=4.0))
     assert (other.render(STATES) != seen).any()
 
 
 def test_longer_poles_fall_slower_and_look_longer() -> None:
-    longer, lean = actual_plant(settings(pole_length=1.2)), 1e-4
+    longer, lean = devices(settings(pole_length=1.2)), 1e-4
     for kind in (plant("desktop"), longer):
         rate = kind.unstable_rate_rad_s
         simulation = kind.simulation(1)
@@ -72,16 +81,14 @@ def test_longer_poles_fall_slower_and_look_longer() -> None:
         )
     ratio = longer.unstable_rate_rad_s / plant("desktop").unstable_rate_rad_s
     assert ratio == pytest.approx(1.2**-0.5)
-    seen, nominal = (
-        actual_camera(settings(pole_length=length)).render(STATES) for length in (1.2, 1.0)
-    )
+    seen, nominal = (camera(settings(pole_length=length)).render(STATES) for length in (1.2, 1.0))
     changed = (seen != nominal).any(-1)
     assert 0 < changed.sum() < 0.02 * changed.size  # the ends of the poles, and nothing else
 
 
 def test_longer_poles_of_what_has_none_are_refused() -> None:
     with pytest.raises(UsageError, match="quadrotor"):
-        actual_plant(settings("quadrotor", pole_length=1.2))
+        devices(settings("quadrotor", pole_length=1.2))
 
 
 def test_a_controller_that_does_not_know_does_worse() -> None:
@@ -114,10 +121,10 @@ def test_rollouts_to_predict_are_of_the_devices_and_training_is_nominal() -> Non
     one, other = (generate(options, "clean", rows) for options in (nominal, longer))
     np.testing.assert_array_equal(one.states[:, 0], other.states[:, 0])
     assert abs(one.states[:, 20] - other.states[:, 20]).max() > 0.01
-    now, devices = other.states[:, 1].astype(float), actual_plant(longer).simulation(6)
-    devices.states = now
-    devices.step(plant("desktop").teacher()(now))  # which does not know of the longer poles
-    np.testing.assert_allclose(devices.states, other.states[:, 2], atol=1e-5)
+    now, moved = other.states[:, 1].astype(float), devices(longer).simulation(6)
+    moved.states = now
+    moved.step(plant("desktop").teacher()(now))  # which does not know of the longer poles
+    np.testing.assert_allclose(moved.states, other.states[:, 2], atol=1e-5)
 
 
 def test_every_training_trajectory_has_a_light_and_a_noise_of_its_own() -> None:
@@ -126,7 +133,7 @@ def test_every_training_trajectory_has_a_light_and_a_noise_of_its_own() -> None:
     def varied(split: str = "train", seed: int = 0, **spreads: float) -> np.ndarray:
         changes = {f"encoder.{name}": value for name, value in spreads.items()}
         options = load_settings(flags={"seed": seed, **changes})
-        return vary(frames, options, split)
+        return vary(frames, options.encoder, options.seed, split)
 
     assert varied() is frames
     lights = varied(light_spread=0.3).astype(float) / 100
@@ -154,7 +161,7 @@ def test_both_training_stages_see_the_same_varied_pictures() -> None:
     for split in ("train", "test"):
         pictures = plant("desktop").camera().render(recorded.states.reshape(-1, 4))
         whole = pictures.reshape(*recorded.states.shape[:2], *pictures.shape[1:])
-        expected = vary(whole, options, split)
+        expected = vary(whole, options.encoder, options.seed, split)
         seen = render(recorded, options, Screen(quiet=True), split)
         np.testing.assert_array_equal(seen.frames.numpy(), expected)
 

@@ -89,7 +89,8 @@ def embedding_driver(
     has no other controller for links that deliver at every step.
     """
     coder, hold = coder_of(settings, model), last_force(model)
-    sensor = embedding_sensor(model, coder.send, actual_camera(settings))
+    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    sensor = embedding_sensor(model, coder.send, camera)
     drives = controller or hold
     reactive = hold if family == "embedding" else drives
     return Driver(name, sensor, drives, reactive, coder.bits, family, two_levels=two_levels)

@@ -1,6 +1,6 @@
 """Embeddings may move linearly, z' = A z + B u + c, as fitted in closed form.
 
-What the hierarchy's predictors have to beat to earn their training.
+The hierarchy's predictors have to beat that to earn their training.
 """
 
 import dataclasses

@@ -1,1 +1,1 @@
-"""Recorded trajectories: made by simulation, kept on disk, handed on in other formats."""
+"""Trajectories are simulated, kept on disk, and handed on in other formats."""

@@ -1,4 +1,4 @@
-"""Datasets: trajectories of one plant in safetensors shards, described by ``dataset.json``.
+"""A dataset keeps one plant's trajectories in safetensors shards; ``dataset.json`` describes them.
 
 ``dataset.json`` is written last and names every shard with its sha256, so a directory is a
 dataset only when it is complete. No time, host or path is stored: equal inputs, equal bytes.

@@ -1,4 +1,4 @@
-"""Datasets for other programs: HDF5 in stable-worldmodel's layout, and NPZ with the same columns.
+"""Other programs get datasets as HDF5 in stable-worldmodel's layout, or as NPZ with its columns.
 
 One row per frame, trajectory after trajectory. A trajectory of T steps gives T + 1 rows: its first
 is the frame before k = 0, which moves on without force. So no frame is lost, and row j of a

@@ -1,9 +1,9 @@
-"""Trajectories for training: the teacher drives, exploration shows what a force does."""
+"""Trajectories train networks: the teacher drives, exploration shows what a force does."""
 
 import numpy as np
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import CollectSettings, Settings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.datasets.dataset import Trajectories
 from hjepa_cli.core.plants.conditions import actual_plant
@@ -13,13 +13,12 @@ STREAM = 1  # this stage's branch of the seed tree
 SPLITS = ("train", "test", "clean")
 
 
-def split_sizes(settings: Settings) -> dict[str, tuple[int, int]]:
+def split_sizes(collect: CollectSettings) -> dict[str, tuple[int, int]]:
     """Return trajectories and control steps of every split."""
-    options = settings.collect
     return {
-        "train": (options.trajectories, options.steps),
-        "test": (options.test_trajectories, options.steps),
-        "clean": (options.clean_trajectories, options.clean_steps),
+        "train": (collect.trajectories, collect.steps),
+        "test": (collect.test_trajectories, collect.steps),
+        "clean": (collect.clean_trajectories, collect.clean_steps),
     }
 
 
@@ -31,13 +30,17 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     teacher's alone. ``clean`` has no exploration, and devices as ``conditions`` have them.
     Trajectory i does not depend on how many there are.
     """
-    kind = plant(settings.plant)
-    size, steps = split_sizes(settings)[split]
-    draws = [_draw(settings, split, i, steps) for i in (range(size) if rows is None else rows)]
+    kind, clean = plant(settings.plant), split == "clean"
+    size, steps = split_sizes(settings.collect)[split]
+    indices = range(size) if rows is None else rows
+    streams = (generator(settings.seed, STREAM, SPLITS.index(split), i) for i in indices)
+    shape = (steps, *kind.action_shape)
+    draws = [_draw(settings.collect, random, shape, clean) for random in streams]
     initial, exploration_n = (np.stack(parts) for parts in zip(*draws, strict=True))
     count = len(initial)
 
-    moved = actual_plant(settings) if split == "clean" else kind  # what methods are measured on
+    # Methods are measured on clean rollouts.
+    moved = actual_plant(settings.plant, settings.conditions) if clean else kind
     force_n, simulation = kind.teacher(), moved.simulation(count)
     simulation.states = initial
     states = np.empty((count, steps + 1, len(kind.state_names)))
@@ -53,14 +56,14 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     return Trajectories(*(array.astype(np.float32) for array in (states, applied_n, teacher_n)))
 
 
-def _draw(settings: Settings, split: str, index: int, steps: int) -> tuple[Floats, Floats]:
+def _draw(
+    collect: CollectSettings, random: np.random.Generator, shape: tuple[int, ...], clean: bool
+) -> tuple[Floats, Floats]:
     """Draw one trajectory's initial state ``[S]`` and piecewise constant pushes ``[steps, *A]``."""
-    options, shape = settings.collect, plant(settings.plant).action_shape
-    random = generator(settings.seed, STREAM, SPLITS.index(split), index)
-    half_widths = np.array(options.half_widths)
+    half_widths = np.array(collect.half_widths)
     initial = random.uniform(-1, 1, half_widths.size) * half_widths
-    if split == "clean":
-        return initial, np.zeros((steps, *shape))
-    hold = options.exploration_hold_steps
-    pushes_n = random.normal(0.0, options.exploration_n, (-(-steps // hold), *shape))
+    if clean:
+        return initial, np.zeros(shape)
+    (steps, *action), hold = shape, collect.exploration_hold_steps
+    pushes_n = random.normal(0.0, collect.exploration_n, (-(-steps // hold), *action))
     return initial, np.repeat(pushes_n, hold, axis=0)[:steps]

@@ -1,4 +1,4 @@
-"""Measured curves on disk, each file sealed to what it was measured with.
+"""Measured curves lie on disk, each file sealed to what it was measured with.
 
 ``curves.json`` holds one entry per method, exactly as ``eval --json`` prints it, under a digest of
 the checkpoint, of the protocol and of the code's version of the closed loop. An entry is reused

@@ -1,4 +1,4 @@
-"""All that ``eval --json`` says of a method: its error when left alone, and its closed loop."""
+"""``eval --json`` says of a method how it errs when left alone, and how its closed loop does."""
 
 import threading
 from concurrent.futures import Future

@@ -83,7 +83,7 @@ class Simulator:
 
     def __init__(self, settings: Settings, model: Model | None) -> None:
         self.settings, self._model = settings, model
-        self.plant = actual_plant(settings)
+        self.plant = actual_plant(settings.plant, settings.conditions)
         self._drivers: dict[str, Driver] = {}
 
     def __call__(self, blocks: Iterable[Block], tick: Tick) -> Callable[[], list[Outcome]]:

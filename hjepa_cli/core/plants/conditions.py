@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import ConditionSettings, EncoderSettings
 from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import Camera, System
@@ -29,22 +29,22 @@ def altered(settings: Mapping[str, Any]) -> dict[str, float]:
     return {key: value for key, value in conditions.items() if value != NOMINAL.get(key)}
 
 
-def actual_plant(settings: Settings) -> System:
+def actual_plant(name: str, conditions: ConditionSettings) -> System:
     """Return the plant of the devices.
 
     Raises:
         UsageError: longer poles of a plant that has none.
     """
-    kind, scale = plant(settings.plant), settings.conditions.pole_length
+    kind, scale = plant(name), conditions.pole_length
     return kind if scale == 1.0 else kind.with_pole_length(scale)
 
 
-def actual_camera(settings: Settings) -> Camera:
+def actual_camera(name: str, conditions: ConditionSettings, seed: int) -> Camera:
     """Return the camera that looks at them."""
-    camera, conditions = actual_plant(settings).camera(), settings.conditions
+    camera = actual_plant(name, conditions).camera()
     if (conditions.light, conditions.camera_noise) == (1.0, 0.0):
         return camera
-    return Disturbed(camera, conditions.light, conditions.camera_noise, settings.seed)
+    return Disturbed(camera, conditions.light, conditions.camera_noise, seed)
 
 
 class Disturbed:
@@ -83,16 +83,16 @@ def disturbed(frames: Pixels, light: float, noise: float, random: np.random.Gene
     return seen
 
 
-def vary(frames: Pixels, settings: Settings, split: str) -> Pixels:
+def vary(frames: Pixels, encoder: EncoderSettings, seed: int, split: str) -> Pixels:
     """Return pictures [N, T, H, W, 3], each trajectory in a light and noise of its own.
 
     The light is uniform in 1 ± ``encoder.light_spread``, the noise's standard deviation between 0
     and ``encoder.camera_noise``. Without both, ``frames`` themselves come back.
     """
-    spread, most = settings.encoder.light_spread, settings.encoder.camera_noise
+    spread, most = encoder.light_spread, encoder.camera_noise
     if not (spread or most):
         return frames
-    random = generator(settings.seed, _VARIED_KEY, _SPLITS.index(split))
+    random = generator(seed, _VARIED_KEY, _SPLITS.index(split))
     varied = np.empty_like(frames)
     for before, after in zip(frames, varied, strict=True):
         light, noise = 1 + spread * random.uniform(-1, 1), most * random.uniform()

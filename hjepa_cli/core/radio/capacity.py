@@ -1,4 +1,4 @@
-"""The radio cell, its links and slots, as all laws of sharing see them; SNRs as users give them.
+"""A radio cell has links and slots, as all laws see them; SNRs are read as users give them.
 
 A cell of W hertz has slots of one control step τ_o; a packet has b bits, the SNR is γ̄.
 """

@@ -64,7 +64,7 @@ def rollout_loss(
 
 
 class InverseDynamics(nn.Module):
-    """Which action led from z_k to z_{k+h}? The auxiliary task needs actions only, no state.
+    """It tells which action led from z_k to z_{k+h}: the auxiliary task needs no state.
 
     It makes the encoder keep what actions change, the velocities above all (ours; it turned the
     recipe from useless to better than supervised, see docs/LOG.md). It is used in training only.

@@ -1,4 +1,4 @@
-"""Training that survives: its state goes to disk as it runs, and the same command takes it up.
+"""Training survives: its state goes to disk as it runs, and the same command takes it up.
 
 ``progress.safetensors`` in the run directory holds weights, moving averages, the optimiser's
 moments, random streams and the rows of ``metrics.csv``, all of the same step. A run that is
@@ -33,7 +33,7 @@ _MISFIT = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError
 
 
 class Part(Protocol):
-    """Anything that training changes: a module, an optimiser."""
+    """Training changes such parts: a module, an optimiser."""
 
     def state_dict(self) -> Mapping[str, Tensor]: ...
 
@@ -41,7 +41,7 @@ class Part(Protocol):
 
 
 class Saved(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The text of ``progress.safetensors``: ``step`` steps of ``phase`` done, in ``seconds``."""
+    """``progress.safetensors`` says that ``step`` steps of ``phase`` are done, in ``seconds``."""
 
     phase: str
     step: Annotated[int, msgspec.Meta(ge=0)]
@@ -54,7 +54,7 @@ class Saved(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class Progress:
-    """The saved state of a training run; a context manager that postpones Ctrl-C inside loops.
+    """It keeps the state of a training run, and as a context manager postpones Ctrl-C inside loops.
 
     All ``ranks`` read it, the first one writes it, and puts the run's metrics back to where it was
     taken; ``say`` tells that a run is taken up. Raises DataError if it is damaged.

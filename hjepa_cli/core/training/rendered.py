@@ -1,4 +1,4 @@
-"""Rendered trajectories in memory, as training reads them."""
+"""Training reads rendered trajectories from memory."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from hjepa_cli.core.training.batches import Labels
 
 @dataclasses.dataclass(frozen=True)
 class RenderedSplit:
-    """One split in memory, as training reads it.
+    """It holds one split in memory, as training reads it.
 
     Attributes:
         frames: uint8 [N, T + 1, H, W, 3]; index 0 is the frame before k = 0.

@@ -42,7 +42,8 @@ def _decoded_on_the_device(settings: Settings, model: Model) -> Driver:
     kind, reader = PLANTS[model.plant_name], fit_state_reader(model, settings)
     controls = reader.quantised, np.asarray, kind.teacher(), kind.force_limit_n
     drives = functools.partial(KalmanController, *controls)
-    embed = embedding_sensor(model, camera=actual_camera(settings))
+    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    embed = embedding_sensor(model, camera=camera)
 
     def sense(seen: Floats) -> Floats:
         return reader.codec.send(reader.read(embed(seen)))

@@ -38,7 +38,8 @@ def _local(settings: Settings, model: Model) -> Driver:
     from hjepa_cli.core.control.sensors import embedding_sensor
     from hjepa_cli.core.plants.conditions import actual_camera
 
-    sensor, drives = embedding_sensor(model, camera=actual_camera(settings)), last_force(model)
+    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    sensor, drives = embedding_sensor(model, camera=camera), last_force(model)
     return Driver("local", sensor, drives, drives, 0, "local", uses_link=False)
 
 

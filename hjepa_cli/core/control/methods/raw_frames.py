@@ -30,7 +30,8 @@ def _method(kind: str, frames: int, style: Style) -> Method:
         def act(seen: NDArray[np.uint8]) -> Tensor:
             return model.actor(model.encode(seen).to(model.device))
 
-        look, drives = camera_sensor(model, actual_camera(settings)), last_force(model, act)
+        camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+        look, drives = camera_sensor(model, camera), last_force(model, act)
         return Driver(name, look, drives, drives, frames * FRAME_BITS, name)
 
     return Method(
