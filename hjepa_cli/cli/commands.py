@@ -102,7 +102,7 @@ def _check_cell(settings: Settings, given: Given) -> None:
 
     parse_snr(settings.radio.snr_db)
     keys = (name.partition(":")[0] for name in SCALE)
-    check_cell(settings.radio, {key: given[key] for key in keys})
+    check_cell(settings.radio, {key: given[key] for key in keys}, settings.nr)
 
 
 def _add_sources(settings: Settings, given: Given) -> None:
@@ -114,6 +114,9 @@ def _add_sources(settings: Settings, given: Given) -> None:
 SCALE = (
     *("radio.snr_db", "radio.law", "radio.schedulers", "radio.uncertainty", "radio.topology"),
     *("radio.bandwidth_hz", "radio.noise", "radio.power_margin_db", "radio.coherence_slots"),
+    *("radio.fading", "radio.speed_m_s", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+    *("nr.pusch_symbols", "nr.mcs_table", "nr.mcs", "nr.bler_target", "nr.link_adaptation"),
+    *("nr.cqi_age_slots", "nr.harq_rounds", "nr.grants", "nr.grants_per_slot", "nr.reports"),
     *("radio.seeds", *MEASURED, "remeasure", "verify", "checkpoint", "dataset:clean", "out"),
 )
 

@@ -26,12 +26,13 @@ from hjepa_cli.config.schema import (
     must_be,
 )
 from hjepa_cli.config.settings import PRESETS, PROTOCOLS
-from hjepa_cli.plugins import LAWS, METHODS, PLANTS, SCHEDULERS
+from hjepa_cli.plugins import LAWS, METHODS, PHYS, PLANTS, SCHEDULERS
 
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
 SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
 PANELS = {  # of help, by section
     "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "radio": RADIO,
+    "nr": RADIO,
     "": SETTINGS,
 }  # fmt: skip
 
@@ -41,6 +42,7 @@ NAMES: Mapping[str, Iterable[str]] = {
     "methods": METHODS,
     "radio.schedulers": SCHEDULERS,
     "radio.law": LAWS,
+    "radio.phy": PHYS,
 }
 
 
@@ -293,7 +295,8 @@ _SETTINGS = {
     "plugin": Input(
         list[Path],
         "--plugin",
-        "Python file that adds plants, codecs, schedulers, methods or laws; may be repeated.",
+        "Python file that adds plants, codecs, schedulers, methods, laws or physical layers; may be "
+        "repeated.",
         "FILE.py",
         default=[],
     ),

@@ -20,7 +20,7 @@ import msgspec
 
 from hjepa_cli.config.schema import PAPER_PROTOCOL, Settings, bare, declared, dotted, must_be
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.plugins import LAWS, PLANTS
+from hjepa_cli.plugins import LAWS, PHYS, PLANTS
 
 CONFIG_LIMIT_BYTES = 2**20
 _FOLDER = resources.files("hjepa_cli.config") / "presets"
@@ -72,7 +72,7 @@ def load_settings(
         return next(one for one in reversed(layers) if key in dotted(one.values)).place(key)
 
     settings = validated(values | {"preset": name}, place)
-    for key, names in (("plant", PLANTS), ("radio.law", LAWS)):
+    for key, names in (("plant", PLANTS), ("radio.law", LAWS), ("radio.phy", PHYS)):
         if (value := operator.attrgetter(key)(settings)) not in names:
             choices = ", ".join(names)
             raise UsageError(f"{key} = {value!r}{place(key)}; choose one of {choices}")

@@ -16,6 +16,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.capacity import parse_snr
+from hjepa_cli.core.radio.doppler import check_speed
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.output.screen import Screen
@@ -65,7 +66,7 @@ def run(
     """
     radio, kind = settings.radio, plant(settings.plant)
     grid_db = parse_snr(radio.snr_db)
-    check_cell(radio, {"remeasure": remeasure})
+    check_cell(radio, {"remeasure": remeasure}, settings.nr)
     count = counting(settings, screen, checkpoint, dataset, further)
     given = {"verify": verify}
     if "remeasure" in LAWS[radio.law].uses:
@@ -111,7 +112,7 @@ def plan(
     """Plan a count of devices; arguments as of :func:`run`."""
     radio, protocol = settings.radio, settings.protocol
     grid_db = parse_snr(radio.snr_db)
-    check_cell(radio, {"remeasure": remeasure})
+    check_cell(radio, {"remeasure": remeasure}, settings.nr)
     count = counting(settings, Screen(quiet=True), checkpoint, dataset, further)
     if isinstance(count, BySimulation):
         reads = [f"model {count.models.name}"]
@@ -167,7 +168,9 @@ def counting(
     further: Sequence[Path] | None = None,
 ) -> ByFormula | BySimulation:
     """Open what is to be counted under the law of the settings; arguments as of :func:`run`."""
-    law = LAWS[settings.radio.law]
+    law, radio = LAWS[settings.radio.law], settings.radio
+    if radio.fading != "block":
+        check_speed(radio.speed_m_s, radio.carrier_ghz, plant(settings.plant).step_s)
     if isinstance(law, ClosedFormLaw):
         return ByFormula(law, settings, screen, checkpoint, dataset, further)
     return BySimulation(settings, screen, checkpoint, further)

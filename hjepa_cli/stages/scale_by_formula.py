@@ -10,7 +10,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
 from hjepa_cli.core.plants.frames import FRAME_BITS
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.core.radio.capacity import Cell
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
@@ -42,7 +42,7 @@ class ByFormula:
     ) -> None:
         self.models = open_measurable(settings, screen, checkpoint, dataset, further)
         self._law, self._settings, self._screen = law, settings, screen
-        self._cell = Cell.of(settings.radio, plant(settings.plant))
+        self._cell = Cell.of(settings, plant(settings.plant))
 
     def measured_methods(self, grid_db: Sequence[float]) -> dict[float, list[str]]:
         """Return by SNR the methods that can be measured, late where the law makes them so.

@@ -18,7 +18,7 @@ from hjepa_cli.core.evaluation import load_simulator
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.coding import packet_uses
 from hjepa_cli.core.radio.factory_hall import drop_devices
-from hjepa_cli.core.radio.uplink import report_bits
+from hjepa_cli.core.radio.phy.shannon import report_bits
 from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import block_loads, report, scale

@@ -6,13 +6,13 @@ The rows, those of ``scale --json``, put the count beside the bits that control 
 import dataclasses
 from collections.abc import Callable
 
-from hjepa_cli.core.radio.capacity import Cell, Link
+from hjepa_cli.core.radio.cell import Cell, Link
 from hjepa_cli.core.radio.laws.law import Row, SharingLaw
 from hjepa_cli.core.radio.laws.requirement import Axis, LinkRequirement
 
 
 def _too_crowded(tolerance: float, loop: LinkRequirement, link: Link) -> str:
-    return f"a packet takes {1 / link.packets_per_slot:.3g} slots; one device alone does not fit"
+    return f"{link.carried.described}; one device alone does not fit"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,9 @@ class ClosedFormLaw(SharingLaw):
         ends = loop.interval or (loop.tolerance, loop.tolerance)
         row["devices"] = self.devices(*at)
         row["devices_ci95"] = [self.devices(end, loop, link) for end in ends]
+        row |= link.carried.details
+        if link.packets_per_slot == 0:
+            return row | {"reason": link.carried.described}
         row["load_per_block"] = row["devices"] / link.packets_per_slot
         if row["devices"] == 0:
             # The range of a method ends at its best link, too, if it was measured nowhere else.
