@@ -58,6 +58,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "train-reflex": "hjepa_cli.stages.pipeline:TRAIN_REFLEX",
         "eval": "hjepa_cli.stages.pipeline:EVAL",
         "scale": "hjepa_cli.stages.pipeline:SCALE",
+        "survive": "hjepa_cli.stages.pipeline:SURVIVE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
     },
     "codec": {

@@ -105,6 +105,13 @@ def _check_cell(settings: Settings, given: Given) -> None:
     check_cell(settings.radio, {key: given[key] for key in keys}, settings.nr)
 
 
+def _check_survival(settings: Settings, given: Given) -> None:
+    from hjepa_cli.core.radio.capacity import parse_snr
+
+    parse_snr(settings.radio.snr_db)
+    check_cell(settings.radio, nr=settings.nr)
+
+
 def _add_sources(settings: Settings, given: Given) -> None:
     """Tell ``config show`` where its values come from."""
     flags = {key: given[key] for key in (*LOOP, "plant", "seed", "device")}
@@ -171,6 +178,17 @@ COMMANDS = (
         prepare=_figure_of_all,
     ),
     staged("scale", takes=(*SCALE, *COMPUTED, *PARALLEL), check=_check_cell),
+    staged(
+        "survive",
+        takes=(
+            *("survival.intervals_steps", "survival.loops", "survival.splitting_paths"),
+            *("survival.loss", "survival.burst_transfers", "survival.mean_time_h"),
+            *("radio.snr_db", "radio.bandwidth_hz", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+            *("nr.pusch_symbols", "nr.bler_target", "nr.harq_rounds"),
+            *(*MEASURED, "checkpoint", "out", *COMPUTED, *PARALLEL),
+        ),
+        check=_check_survival,
+    ),
     Command(
         "resume",
         "Take up an interrupted run: same settings, same inputs, same result.",

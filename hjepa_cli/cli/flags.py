@@ -32,7 +32,7 @@ DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
 SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
 PANELS = {  # of help, by section
     "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "radio": RADIO,
-    "nr": RADIO,
+    "nr": RADIO, "survival": LOOP,
     "": SETTINGS,
 }  # fmt: skip
 

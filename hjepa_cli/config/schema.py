@@ -475,6 +475,36 @@ class NrSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class SurvivalSettings:
+    """``survive`` silences loops so, and asks so much of links."""
+
+    intervals_steps: Annotated[
+        tuple[Count, ...],
+        Flag("--intervals", "Control steps between packets in time, separated by commas.", "N,N"),
+    ] = (10, 40)
+    loops: Annotated[Count, Flag("--loops", "Loops through each silence.")] = 256
+    splitting_paths: Annotated[
+        CountOrNone,
+        Flag("--splitting", "Paths for losses of 1 in 10,000; 0: a bound from what was counted."),
+    ] = 128
+    loss: Annotated[
+        float,
+        Meta(gt=0, lt=0.5),
+        Flag("--loss", "Share of transfers that a link loses, to tell how long control lasts.", "P"),
+    ] = 1e-3
+    burst_transfers: Annotated[
+        float,
+        Meta(ge=1, le=1e4),
+        Flag("--burst-transfers", "Mean transfers in a run of losses, where they come in bursts.",
+             "N"),
+    ] = 4.0
+    mean_time_h: Annotated[
+        Positive,
+        Flag("--mean-time-hours", "Mean time between losses of control to be reached.", "HOURS"),
+    ] = 8760.0
+
+
+@dataclasses.dataclass(frozen=True)
 class Settings:
     """All of these define a run, besides the paths it reads and writes."""
 
@@ -502,6 +532,7 @@ class Settings:
     conditions: ConditionSettings = ConditionSettings()
     radio: RadioSettings = RadioSettings()
     nr: NrSettings = NrSettings()
+    survival: SurvivalSettings = SurvivalSettings()
 
     def as_dict(self) -> dict[str, Any]:
         """Return nested plain data, ready for JSON (tuples become lists).

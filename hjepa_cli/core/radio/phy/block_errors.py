@@ -27,7 +27,10 @@ TABLES = tuple(LOWEST_MCS)
 
 @dataclasses.dataclass(frozen=True)
 class BlockErrors:
-    """Holds one MCS table of TS 38.214, clause 5.1.3.1, with its simulated error rates.
+    """Holds one MCS table of TS 38.214, clause 6.1.4.1, with its simulated error rates.
+
+    Sionna's PUSCH tables are those of transform precoding (6.1.4.1-1 and -2), whatever its own
+    default is: as the 256QAM that table 2 else stands for they would lie beyond capacity.
 
     Attributes:
         mcs: indices that error rates are there of [M].
@@ -89,7 +92,7 @@ def check_installed() -> None:
 
 @functools.cache
 def block_errors(table: int) -> BlockErrors:
-    """Return MCS table 1 (up to 64QAM) or 2 (256QAM), read from Sionna's files at the first call.
+    """Return MCS table 1 or 2 (low rates), read from Sionna's files at the first call.
 
     Raises:
         UsageError: Sionna is not installed.
@@ -124,7 +127,9 @@ def _sionna() -> tuple[Any, Any]:
     abstraction = sionna.sys.PHYAbstraction(load_bler_tables_from=files, device="cpu")
 
     def decode(mcs: Integers, table: int) -> tuple[Integers, Floats]:
-        orders, rates = decode_mcs_index(torch.from_numpy(mcs), table, device="cpu")
+        orders, rates = decode_mcs_index(
+            torch.from_numpy(mcs), table, transform_precoding=True, device="cpu"
+        )
         return orders.numpy().astype(np.int64), rates.numpy().astype(np.float64)
 
     return abstraction, decode
