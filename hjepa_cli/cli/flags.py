@@ -295,8 +295,8 @@ _SETTINGS = {
     "plugin": Input(
         list[Path],
         "--plugin",
-        "Python file that adds plants, codecs, schedulers, methods, laws or physical layers; may be "
-        "repeated.",
+        "Python file that adds plants, codecs, schedulers, methods, laws or physical layers; may "
+        "be repeated.",
         "FILE.py",
         default=[],
     ),

@@ -37,6 +37,7 @@ TOPOLOGIES = {
     **dict.fromkeys(("radio.scenario", "radio.carrier_ghz", "radio.power_dbm"), "hall"),
     "radio.noise_figure_db": "hall",
 }
+DEFAULT_NR = NrSettings()
 # What is read of fading of some kinds only; all but "block" have a Doppler.
 DOPPLER = ("radio.speed_m_s", "radio.delay_spread_s")
 FADINGS = {
@@ -160,7 +161,7 @@ def check_gaps(protocol: ProtocolSettings) -> None:
 def check_cell(
     radio: RadioSettings,
     given: Mapping[str, object] = MappingProxyType({}),
-    nr: NrSettings = NrSettings(),
+    nr: NrSettings = DEFAULT_NR,
 ) -> None:
     """Raise UsageError for what was set of a cell and is not read, naming what would read it.
 

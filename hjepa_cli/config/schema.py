@@ -398,7 +398,9 @@ class NrSettings:
     """The uplink of ``--phy nr`` is configured so: one layer of PUSCH, DFT-s-OFDM, FR1."""
 
     spacing_khz: Annotated[
-        int, Meta(ge=15, le=60), Flag("--scs", "PHY nr: subcarrier spacing in kHz: 15, 30, 60.", "KHZ")
+        int,
+        Meta(ge=15, le=60),
+        Flag("--scs", "PHY nr: subcarrier spacing in kHz: 15, 30, 60.", "KHZ"),
     ] = 30
     duplex: Annotated[
         str,
@@ -490,13 +492,18 @@ class SurvivalSettings:
     loss: Annotated[
         float,
         Meta(gt=0, lt=0.5),
-        Flag("--loss", "Share of transfers that a link loses, to tell how long control lasts.", "P"),
+        Flag(
+            "--loss", "Share of transfers that a link loses, to tell how long control lasts.", "P"
+        ),
     ] = 1e-3
     burst_transfers: Annotated[
         float,
         Meta(ge=1, le=1e4),
-        Flag("--burst-transfers", "Mean transfers in a run of losses, where they come in bursts.",
-             "N"),
+        Flag(
+            "--burst-transfers",
+            "Mean transfers in a run of losses, where they come in bursts.",
+            "N",
+        ),
     ] = 4.0
     mean_time_h: Annotated[
         Positive,

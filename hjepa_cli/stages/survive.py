@@ -5,6 +5,7 @@ control for a given time, and how many devices a cell has at that transfer inter
 the form of TS 22.104's.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -25,7 +26,7 @@ from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.duty import duty_devices
 from hjepa_cli.errors import MissingInputError, UsageError
-from hjepa_cli.output.screen import Screen, ticking
+from hjepa_cli.output.screen import Screen, span, ticking
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.measuring import cached, seconds_of_loops
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
@@ -172,7 +173,9 @@ def measured(
             "method": name,
             "interval_steps": interval,
             "transfer_interval_s": interval * plant.step_s,
-            "tolerance_gap_steps": curves[name][0]["tolerance_gap_steps"] if name in curves else None,
+            "tolerance_gap_steps": curves[name][0]["tolerance_gap_steps"]
+            if name in curves
+            else None,
             "devices": int(duty_devices(interval, carried.packets_per_slot))
             if carried.packets_per_slot
             else 0,
@@ -229,7 +232,9 @@ class Survivals:
                 limit = self._settings.protocol.gaps[-1] * LONGER**MOST_LONGER
                 wanted = [round(longest * LONGER)] if longest < limit else []
             else:
-                wanted = [gap for gap in curve.wanted(survival.LEVELS, WIDTH) if gap not in outcomes]
+                wanted = [
+                    gap for gap in curve.wanted(survival.LEVELS, WIDTH) if gap not in outcomes
+                ]
             if not wanted:
                 break
         rare = self._rare(method, trial, curve) if options.splitting_paths else []
@@ -250,7 +255,7 @@ class Survivals:
         cuts = [loops * number // count for number in range(count + 1)]
         units = [
             Gaps(method, trial, tuple(gaps), start, stop)
-            for start, stop in zip(cuts, cuts[1:], strict=False)
+            for start, stop in itertools.pairwise(cuts)
         ]
         futures = [self._submit(method, unit) for unit in units]
         joined = Silences.joined(self._workers.results(futures, self._tick))
@@ -259,9 +264,7 @@ class Survivals:
             for i, gap in enumerate(gaps)
         }
 
-    def _rare(
-        self, method: str, trial: Trial, curve: LossCurve
-    ) -> list[tuple[int, float, float]]:
+    def _rare(self, method: str, trial: Trial, curve: LossCurve) -> list[tuple[int, float, float]]:
         """Return gaps, ascending, with the probability by splitting and its error in logarithms.
 
         The first is the longest at which not even one loop in a hundred is lost; from there along
@@ -296,9 +299,7 @@ def counted(outcomes: Mapping[int, Silences]) -> LossCurve:
     return LossCurve(np.array(gaps), np.array(lost), np.array(loops))
 
 
-def next_rare_gap(
-    curve: LossCurve, found: Mapping[int, tuple[float, float]], interval: int
-) -> int:
+def next_rare_gap(curve: LossCurve, found: Mapping[int, tuple[float, float]], interval: int) -> int:
     """Return where the logarithm of the probability should be that of one in 10,000."""
     known = {
         gap: p for gap, p in zip(curve.gaps.tolist(), curve.probability.tolist(), strict=True) if p
@@ -402,7 +403,7 @@ def described(gap: int, outcome: Silences, trial: Trial) -> Row:
 
 
 def needed_links(curve: Row, settings: Settings, step_s: float) -> dict[str, Any]:
-    """Return what links a curve of losses makes, independent or in bursts, and how long they last."""
+    """Return what links go with a curve of losses, independent and in bursts, for how long."""
     options, interval = settings.survival, curve["interval_steps"]
     points = curve["points"]
     counts = LossCurve(
@@ -432,7 +433,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
             curve["method"],
             f"{curve['interval_steps'] * step_ms:g}",
             f"{point['gap_steps'] * step_ms:g}",
-            f"{point['p_lost']:.4f} ({point['p_lost_ci95'][0]:.4f} – {point['p_lost_ci95'][1]:.4f})",
+            span(point["p_lost"], point["p_lost_ci95"], 4),
             f"{point['p_left_band']:.2f}",
             *(
                 "never" if point[key] is None else f"{point[key] * step_ms:g}"

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjepa_cli.core.radio import capacity
-from hjepa_cli.core.radio.channel import outage_probability
 from hjepa_cli.core.radio.cell import Cell
+from hjepa_cli.core.radio.channel import outage_probability
 from hjepa_cli.core.radio.laws import duty
 from hjepa_cli.core.radio.laws.scheduled import ScheduledBand
 from hjepa_cli.core.radio.phy import equal_parts as equal

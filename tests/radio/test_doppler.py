@@ -54,7 +54,7 @@ def test_the_first_links_do_not_depend_on_how_many_there_are():
 
 
 def test_a_wide_band_averages_over_a_frequency_selective_channel():
-    """Two equal taps 1 µs apart: over 20 MHz the gain is their mean power, with half the variance."""
+    """Two equal taps 1 µs apart: over 20 MHz the gain has half the variance."""
     two = Taps(np.array([0.0, 1e-6]), np.array([0.5, 0.5]))
     wide, narrow = (
         gains(1, taps=two, bandwidth_hz=20e6, allocation_hz=width)[0] for width in (20e6, 360e3)

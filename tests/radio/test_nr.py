@@ -173,7 +173,9 @@ def test_tdd_has_the_share_of_its_pattern():
     fdd, tdd = layer().carries(INT8, 20.0), layer(duplex="DDDSU").carries(INT8, 20.0)
     assert tdd.packets_per_slot == pytest.approx(fdd.packets_per_slot / 5, rel=1e-9)
     assert layer(duplex="DDDSU")._round_trip_slots == 5.0
-    assert layer(duplex="DSUUU", harq_rtt_slots=2)._round_trip_slots == pytest.approx((2 + 4 + 3) / 3)
+    assert layer(duplex="DSUUU", harq_rtt_slots=2)._round_trip_slots == pytest.approx(
+        (2 + 4 + 3) / 3
+    )
 
 
 def test_numerologies_and_mapping():

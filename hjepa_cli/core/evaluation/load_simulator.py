@@ -141,7 +141,7 @@ class LoadSimulator(Simulator):
         self._teacher: dict[int, Floats] = {}
 
     def motion(self, allocation_hz: float) -> Motion | None:
-        """Return how links move whose transmissions have a part of the band; ``None``: in blocks."""
+        """Return how links move that send on a part of the band; ``None``: fades are blocks."""
         radio = self.settings.radio
         if radio.fading == "block":
             return None

@@ -195,8 +195,8 @@ def splitting(
 
     Returns:
         The probability, 0 where paths come no further, and about the standard deviation of its
-        logarithm: 1.5 times that of independent paths, √(Σ (1 − p)/(p n)) over the levels, which copies
-        are not; ∞ where it is 0.
+        logarithm: 1.5 times that of independent paths, √(Σ (1 − p)/(p n)) over the levels, which
+        copies are not; ∞ where it is 0.
     """
     normal, count = normal.copy(), normal.shape[1]
     rows = np.arange(count)
@@ -299,8 +299,8 @@ def loss_of_gap(curve: LossCurve, rare: Sequence[tuple[int, float]]) -> Callable
     """Return the probability that a loop is lost in a gap, of any length.
 
     Between what was counted, and found by splitting, the logarithm is linear. The longest gap in
-    which none of n loops was lost counts with 3/n, the upper end of its 95 % interval, where nothing
-    else is known below the others. Below, the line through the two shortest goes on: losses are
+    which none of n loops was lost counts with 3/n, the upper end of its 95 % interval, where
+    nothing else is known below the others. Below, the line through the two shortest goes on: losses are
     rarer there still, since their logarithm falls ever faster, so that it is a bound; above, every
     loop is lost.
     """
@@ -364,7 +364,7 @@ def losses_per_transfer(
     silence, is not the link's.
     """
     most = int(np.clip(60 * link.burst, 64, LONGEST_RUN))
-    gaps = (np.arange(1, most + 1) + 1.0) * interval_steps
+    gaps = np.arange(2, most + 2).astype(np.float64) * interval_steps
     weights = link.run_lengths(most)
     without = float(lost(np.array([float(interval_steps)]))[0])
     caused = np.maximum(lost(gaps) - without, 0.0)

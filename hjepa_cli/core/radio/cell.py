@@ -1,4 +1,4 @@
-"""A radio cell has links and slots, as all laws see them; its physical layer says what they carry."""
+"""A radio cell has links and slots, as all laws see them, and a physical layer."""
 
 import dataclasses
 

@@ -22,6 +22,7 @@ from hjepa_cli.core.radio.schedulers.scheduler import SlotView, pick
 from hjepa_cli.errors import UsageError
 from hjepa_cli.plugins import SCHEDULERS
 
+EIGHT_BITS = Reports(INNOVATION_BITS)
 CHECK_PERIOD = 8  # slots between a device's looks at its own camera, staggered over devices
 REPORT_AGAIN = 2.0  # times the last report: an innovation is reported once, and when it doubles
 REPORTS_PER_BLOCK = 1.0  # that δ is steered to: a candidate for every transmission
@@ -60,7 +61,7 @@ class Access:
     seed: int
     levels: LevelDisagreement | None = None
     round_trip_slots: int = 1
-    reports: Reports = Reports(INNOVATION_BITS)
+    reports: Reports = EIGHT_BITS
     motion: Motion | None = None
 
 

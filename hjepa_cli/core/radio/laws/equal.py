@@ -22,8 +22,6 @@ EQUAL = ClosedFormLaw(
     uses=("radio.noise", "remeasure", "dataset"),
     snr_label="Mean SNR (dB)",
     axis=DELIVERY,
-    devices=lambda p, loop, link: link.phy.shared_by(
-        p, link.payload_bits, link.snr_db, link.noise
-    ),
+    devices=lambda p, loop, link: link.phy.shared_by(p, link.payload_bits, link.snr_db, link.noise),
     why_nobody=_why_nobody,
 )

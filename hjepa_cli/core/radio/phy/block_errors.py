@@ -138,4 +138,4 @@ def _sionna() -> tuple[Any, Any]:
 def _nearest(grid: Floats, values: npt.ArrayLike) -> Integers:
     step = grid[1] - grid[0]
     place = np.rint((np.asarray(values, np.float64) - grid[0]) / step).astype(np.int64)
-    return np.clip(place, 0, len(grid) - 1)
+    return np.asarray(np.clip(place, 0, len(grid) - 1))

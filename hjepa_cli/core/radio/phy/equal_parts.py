@@ -1,4 +1,4 @@
-"""Devices that send in every slot at capacity, on equal parts of the band, are counted in closed form.
+"""Devices that send in every slot on equal parts of the band are counted in closed form.
 
 All N send on W/N hertz over Rayleigh fading. At a mean SNR of γ̄ they get through with probability
 p; N is the largest number with p ≥ p*.

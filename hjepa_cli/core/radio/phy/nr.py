@@ -94,7 +94,9 @@ class NrUplink:
             self._aged_db = aged_offsets_db(correlation)
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019 - a handful of layers, asked again and again
-    def carries(self, payload_bits: float, snr_db: float, *, dynamic: bool | None = None) -> Carried:
+    def carries(
+        self, payload_bits: float, snr_db: float, *, dynamic: bool | None = None
+    ) -> Carried:
         """Return what slots carry: the allocation that takes least of them per packet delivered."""
         check_snr(snr_db)
         if dynamic is None:
@@ -202,7 +204,7 @@ class NrUplink:
 
     @property
     def _round_trip_slots(self) -> float:
-        """Return slots from a transmission to its repetition: the next uplink slot after so many."""
+        """Return slots from a transmission to its repetition, in the next uplink slot."""
         wait, pattern = self._nr.harq_rtt_slots, self._nr.duplex
         if pattern == "FDD":
             return wait
@@ -279,7 +281,7 @@ class NrUplink:
         """
         copies = 10.0 * np.log10(np.arange(1, self._nr.harq_rounds + 1))
         errors = [self._block_errors(snr_db + gain_db, self._aged_db) for gain_db in copies]
-        return np.stack(np.minimum.accumulate(errors))
+        return np.asarray(np.minimum.accumulate(np.stack(errors)))
 
     def _block_errors(self, snr_db: float, offsets_db: Floats) -> Floats:
         """Return the mean transport block error of each MCS and width over SNRs around one [M, P].

@@ -70,7 +70,9 @@ class PhysicalLayer(Protocol):
     @property
     def overhead_bits(self) -> int: ...
 
-    def carries(self, payload_bits: float, snr_db: float, *, dynamic: bool | None = None) -> Carried:
+    def carries(
+        self, payload_bits: float, snr_db: float, *, dynamic: bool | None = None
+    ) -> Carried:
         """Return what slots carry of packets of b bits, power-controlled to an SNR.
 
         ``dynamic`` tells whether each transmission is granted by itself, where that makes a

@@ -39,7 +39,9 @@ class Shannon:
         return cls(radio.bandwidth_hz, slot_s, *coding)
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019 - small, frozen, and asked again and again
-    def carries(self, payload_bits: float, snr_db: float, *, dynamic: bool | None = None) -> Carried:
+    def carries(
+        self, payload_bits: float, snr_db: float, *, dynamic: bool | None = None
+    ) -> Carried:
         """Return what slots carry; grants cost nothing here."""
         c = float(slot_capacity(payload_bits, self.bandwidth_hz, self.slot_s, snr_db))
         bits = payload_bits + self.overhead_bits

@@ -89,8 +89,8 @@ def transport_block(
     fitting = np.minimum(np.searchsorted(SMALL_SIZES, small), len(SMALL_SIZES) - 1)
 
     body = np.maximum(wanted - 24, 1.0)
-    unit = 2.0 ** (_floor_log2(body) - 5)
-    large = np.maximum(3840, unit * np.floor(body / unit + 0.5))  # ties go up
+    step = 2.0 ** (_floor_log2(body) - 5)
+    large = np.maximum(3840, step * np.floor(body / step + 0.5))  # ties go up
     most = np.where(rate <= LOW_RATE, LOW_RATE_CODE_BLOCK_BITS, CODE_BLOCK_BITS)
     several = (rate <= LOW_RATE) | (large > CODE_BLOCK_BITS)
     blocks = np.where(several, np.ceil((large + 24) / most), 1.0)
