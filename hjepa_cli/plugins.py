@@ -2,8 +2,8 @@
 
 Seven kinds of things can be added without a change to the package: plants, codecs, schedulers,
 methods, sharing laws, physical layers and stages. Each is one object, made with a class of the
-package, and has a name. Codecs and methods may be families, whose ``member(name)`` makes the extension of a name, as
-``pca-8x6``, or returns ``None`` for the names of others.
+package, and has a name. Codecs and methods may be families, whose ``member(name)`` makes the
+extension of a name, as ``pca-8x6``, or returns ``None`` for the names of others.
 
 The package's own are listed in :data:`BUILT_IN` and imported when one is asked for; others
 come from an entry point of the group ``hjepa.plugins``, a module that calls :func:`register`, or

@@ -300,9 +300,9 @@ def loss_of_gap(curve: LossCurve, rare: Sequence[tuple[int, float]]) -> Callable
 
     Between what was counted, and found by splitting, the logarithm is linear. The longest gap in
     which none of n loops was lost counts with 3/n, the upper end of its 95 % interval, where
-    nothing else is known below the others. Below, the line through the two shortest goes on: losses are
-    rarer there still, since their logarithm falls ever faster, so that it is a bound; above, every
-    loop is lost.
+    nothing else is known below the others. Below, the line through the two shortest goes on: losses
+    are rarer there still, since their logarithm falls ever faster, so that it is a bound; above,
+    every loop is lost.
     """
     known = dict(zip(curve.gaps.tolist(), curve.probability.tolist(), strict=True))
     known |= {gap: p for gap, p in rare if p > 0 and known.get(gap, 0.0) == 0.0}
