@@ -20,6 +20,7 @@ from hjepa_cli.core.radio.doppler import check_speed
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.output.tables import ALLOCATION, show_allocations
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.stages.evaluate import reads_of
 from hjepa_cli.stages.measuring import plan_curves, seconds_of_loops
@@ -82,6 +83,8 @@ def run(
                 "seed": settings.seed,
                 "acceptable_score": settings.protocol.acceptable_score,
                 "law": radio.law,
+                "phy": radio.phy,
+                **({} if radio.phy == "shannon" else {"nr": settings.as_dict()["nr"]}),
                 "bandwidth_hz": radio.bandwidth_hz,
                 "slot_s": kind.step_s,
                 "limit_bits_per_s": kind.data_rate_limit_bits_per_s,
@@ -94,6 +97,7 @@ def run(
             result["figures"] = draw(result, record.directory, screen)
             result = record.finish(result)
         count.show(result)
+        show_allocations(result["rows"], screen)
         screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
         enforce(result)
         return result
@@ -179,6 +183,8 @@ def counting(
 def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> Path:
     """Write the rows in long format: a line per SNR and method, units in the header."""
     text = io.StringIO()
+    if any("mcs" in row for row in rows):
+        columns = (*columns, *ALLOCATION)
     table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     table.writeheader()
     for row in rows:

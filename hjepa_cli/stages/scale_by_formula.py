@@ -16,7 +16,7 @@ from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.output.screen import Screen, described_steps, percent, span
-from hjepa_cli.plugins import LAWS, METHODS
+from hjepa_cli.plugins import LAWS, METHODS, PHYS
 from hjepa_cli.stages.evaluate import open_measurable
 from hjepa_cli.stages.measuring import curves_for, measure_points
 from hjepa_cli.stages.verification import VERIFY_AT, show_verdicts, verdict
@@ -171,6 +171,8 @@ def described(result: Mapping[str, Any]) -> str:
     law = f"{result['law']} law"
     if result.get("noise") == "scaled" and "radio.noise" in LAWS[result["law"]].uses:
         law += ", scaled noise"
+    if (phy := result.get("phy", "shannon")) != "shannon":
+        law += f", {PHYS[phy].help}" if phy in PHYS else f", {phy}"
     return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
 
 
