@@ -43,7 +43,7 @@ def test_listing_stages_imports_nothing_heavy():
     done = subprocess.run(
         [sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=False
     )
-    pipeline = "collect train-encoder train-hierarchy train-reflex eval scale reproduce"
+    pipeline = "collect train-encoder train-hierarchy train-reflex eval scale survive reproduce"
     assert (done.returncode, done.stdout) == (0, f"{pipeline}\n"), done.stderr
 
 
