@@ -73,10 +73,14 @@ def run(
     with Run.create("survive", out, settings.as_dict(), models.inputs()) as record:
         result = record.result
         if result is None:
-            result = record.finish(measured(models, methods, screen, record))
+            result = measured(models, methods, screen, record)
+            result["figures"] = draw(result, record.directory, screen)
+            result = record.finish(result)
         else:
             screen.say(f"{record.directory} is finished; this is its result")
         show(result, screen)
+        if result["figures"]:
+            screen.say(f"written: {', '.join(map(str, result['figures']))}")
         return result
 
 
@@ -423,6 +427,20 @@ def needed_links(curve: Row, settings: Settings, step_s: float) -> dict[str, Any
         values[f"tolerated_loss{kind}"] = tolerated
         links[kind] = of(tolerated) if tolerated else None
     return {"values": values, "links": links}
+
+
+def draw(result: Mapping[str, Any], directory: Path, screen: Screen) -> list[Path]:
+    """Write ``survival.png`` and ``survival.svg``; without matplotlib say how to get them."""
+    try:
+        from hjepa_cli.output import figures
+    except ModuleNotFoundError as missing:
+        if not (missing.name or "").startswith("matplotlib"):
+            raise
+        screen.say('no figure without matplotlib: pip install "hjepa[plot]"')
+        return []
+    title = f"{result['plant']}, {result['n_loops']} loops, 95 % CI"
+    figure = figures.survival_figure(result, title=title)
+    return [figures.save(figure, directory / f"survival.{kind}") for kind in ("png", "svg")]
 
 
 def show(result: Mapping[str, Any], screen: Screen) -> None:
