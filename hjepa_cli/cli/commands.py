@@ -27,7 +27,11 @@ RESOLVED = ("preset", "config", "plant", "seed")  # what takes these is given se
 COMPUTED = (*RESOLVED, "device")
 PARALLEL = ("workers", "cluster")
 LOOP = ("methods", "protocol")
-MEASURED = (*LOOP, "protocol.process_noise", "protocol.plant_spread", "protocol.payload")
+LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss")
+MEASURED = (
+    *(*LOOP, "protocol.process_noise", "protocol.plant_spread", "protocol.payload"),
+    *LINK,
+)
 
 Given = dict[str, Any]  # what was given, by dotted key or argument; None: not given
 
@@ -183,7 +187,7 @@ COMMANDS = (
         Imported("hjepa_cli.stages.view:run"),
         (
             *("methods:view", "devices", "snr_db", "delivery", "gap_steps", "every", "fps", "live"),
-            *("radio.bandwidth_hz", "checkpoint", "out:animation", *COMPUTED),
+            *("radio.bandwidth_hz", *LINK, "checkpoint", "out:animation", *COMPUTED),
         ),
         plan=Imported("hjepa_cli.stages.view:plan"),
         product="file",

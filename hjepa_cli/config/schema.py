@@ -26,6 +26,7 @@ Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,6 +233,16 @@ class ProtocolSettings:
             "FRACTION",
         ),
     ] = 0.0
+    delay_steps: Annotated[
+        Delay, Flag("--delay-steps", "Steps from a packet's capture to the force that answers it.")
+    ] = 0
+    jitter_steps: Annotated[
+        Delay, Flag("--jitter-steps", "Up to so many steps more, anew for every packet.")
+    ] = 0
+    downlink_loss: Annotated[
+        BelowOne,
+        Flag("--downlink-loss", "Share of datagrams with forces that are lost.", "FRACTION"),
+    ] = 0.0
     payload: Annotated[
         str,
         Flag(
@@ -263,6 +274,8 @@ class ProtocolSettings:
         """Return the standard deviation of what disturbs a step, one per state."""
         return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
 
+
+IDEAL_LINK = ("delay_steps", "jitter_steps", "downlink_loss")  # all 0 in the paper
 
 # What --protocol paper sets over these: scored from the start on.
 PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
@@ -403,10 +416,14 @@ class Settings:
     def as_dict(self) -> dict[str, Any]:
         """Return nested plain data, ready for JSON (tuples become lists).
 
-        Empty lists are left out: they stand for values that say the same, and digests of settings
-        stay what they were before there were such lists.
+        Empty lists and the zeros of an ideal link are left out: they stand for values that say the
+        same, and digests of settings stay what they were before there were such settings.
         """
-        return typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+        plain = typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+        for key in IDEAL_LINK:
+            if not plain["protocol"][key]:
+                del plain["protocol"][key]
+        return plain
 
 
 @functools.cache

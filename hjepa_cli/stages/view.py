@@ -13,6 +13,7 @@ import torch
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.drivers import build_driver, methods_of
 from hjepa_cli.core.control.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
@@ -43,21 +44,25 @@ class Believer:
     def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
         self._controller, self._probe = controller, probe
         self._last: torch.Tensor | None = None
+        self._heard = False
         self.believed: list[Floats] = []
 
-    def act(self, delivered: Bools, packets: Any) -> Floats:
+    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]."""
-        forces_n = self._controller.act(delivered, packets)
-        if isinstance(self._controller, StrideController):
+        forces_n = self._controller.act(delivered, packets, ages)
+        self._heard |= packets is not None
+        if not self._heard:  # the link is late: a device is believed to be at rest
+            states = np.zeros((len(delivered), self._probe.shape[1]))
+        elif isinstance(self._controller, StrideController):
             start, end, share = self._controller.belief
             states = self._read(start)
             states += share[:, None] * (self._read(end) - states)
         else:  # no prediction: what it received last
             if packets is not None:
                 if self._last is None:
-                    self._last = packets.clone()
+                    self._last = packets.new_zeros(len(delivered), packets.shape[1])
                 self._last[torch.from_numpy(delivered)] = packets
-            assert self._last is not None, "the first packets always arrive"
+            assert self._last is not None
             states = self._read(self._last)
         self.believed.append(states)
         return forces_n

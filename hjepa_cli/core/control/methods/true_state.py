@@ -34,8 +34,9 @@ def true_state_driver(name: str, kind: System, bits_per_transmission: int) -> Dr
     reactive = functools.partial(last_force, keep=True)
     drives: Any = reactive
     if name == "oracle":
-        states, limit_n = len(kind.state_names), kind.force_limit_n
-        drives = functools.partial(Oracle, teacher, kind.advance, limit_n, states=states)
+        states, shape = len(kind.state_names), kind.action_shape
+        exactly = functools.partial(Oracle, teacher, kind.advance, kind.force_limit_n)
+        drives = functools.partial(exactly, states=states, action_shape=shape)
     elif name == "zero-true":
         drives = functools.partial(last_force, keep=False)
     uses_link = name != "optimal"
