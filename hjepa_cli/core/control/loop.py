@@ -112,9 +112,14 @@ class Draws:
 
     def part(self, devices: slice) -> "Draws":
         """Take the draws of some of the devices."""
-        by_step = self.noise[:, devices], self.delivery[:, devices]
-        rest = self.mass_scale[devices], self.warmup_steps, self.link.part(devices)
-        return Draws(self.initial[devices], *by_step, *rest)
+        return Draws(
+            self.initial[devices],
+            self.noise[:, devices],
+            self.delivery[:, devices],
+            self.mass_scale[devices],
+            self.warmup_steps,
+            self.link.part(devices),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
