@@ -78,6 +78,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "zero-true": f"{_CONTROL}.methods.true_state:ZERO_TRUE",
         "optimal": f"{_CONTROL}.methods.true_state:OPTIMAL",
         "oracle": f"{_CONTROL}.methods.true_state:ORACLE",
+        "oracle-teacher": f"{_CONTROL}.methods.true_state:ORACLE_TEACHER",
+        "ceiling": f"{_CONTROL}.methods.true_state:CEILING",
         "linear": f"{_CONTROL}.methods.predictors:LINEAR",
         "state-kf": f"{_CONTROL}.methods.filtered_state:STATE_KF",
         "state-48": f"{_CONTROL}.methods.filtered_state:STATE_48",

@@ -282,6 +282,23 @@ PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
 
 
 @dataclasses.dataclass(frozen=True)
+class ControlSettings:
+    """``collect`` and all after it: the law that models learn and that their rivals play.
+
+    Without one it is the plant's own teacher. :mod:`hjepa_cli.core.plants.control_law` says what
+    the numbers are, force by force; ``hjepa tune-law`` finds them.
+    """
+
+    slow_gains: tuple[Number, ...] = ()
+    fast_gains: tuple[Number, ...] = ()
+    cap_n: tuple[NotNegative, ...] = ()
+    # Of method ``ceiling``, which no actor has to learn.
+    ceiling_slow_gains: tuple[Number, ...] = ()
+    ceiling_fast_gains: tuple[Number, ...] = ()
+    ceiling_cap_n: tuple[NotNegative, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
 class ConditionSettings:
     """Devices of ``eval`` and ``scale`` may differ so from those that models were trained on.
 
@@ -404,6 +421,7 @@ class Settings:
         *("hjepa", "ts-jepa-1", "ts-jepa-4", "chunk", "hold-decay-linear"),
         *("hold", "optimal", "oracle"),
     )
+    control: ControlSettings = ControlSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
     actor: ActorSettings = ActorSettings()
@@ -423,6 +441,8 @@ class Settings:
         for key in IDEAL_LINK:
             if not plain["protocol"][key]:
                 del plain["protocol"][key]
+        if not plain["control"]:
+            del plain["control"]
         return plain
 
 

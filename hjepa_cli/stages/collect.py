@@ -74,6 +74,8 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     }
     if conditions := altered(settings.as_dict()):  # clean rollouts are of such devices
         definition["conditions"] = conditions
+    if control := settings.as_dict().get("control"):
+        definition["control"] = control
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
             return describe_finished(directory, screen, settings.plant, definition)

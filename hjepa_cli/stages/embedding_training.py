@@ -18,6 +18,7 @@ from hjepa_cli.core.control.force_error import window_means
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks.model import Model, tensors_of
+from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, fit_actor
@@ -60,7 +61,8 @@ def embed_all(
     what the teacher does there. With ``flip`` all of these are there in the mirror too.
     """
     device, kind, count = resolve_device(settings.device), plant(settings.plant), len(train.frames)
-    mirror, teach = torch.tensor(kind.mirror), labels_of(train, kind)
+    act, mirror = control_law(kind, settings.control), torch.tensor(kind.mirror)
+    teach = labels_of(train, kind, act)
     every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
     views = []
     for mirrored, shifts_px in views_of(settings, count, flip=flip):

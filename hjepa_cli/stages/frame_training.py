@@ -52,7 +52,7 @@ def fit(
         mirror=options.mirror == "augment",
         shift_px=options.shift_px,
         mirrored_actions=kind.mirror,
-        labels=labels_of(train, kind),
+        labels=labels_of(train, kind, control_law(kind, settings.control)),
         frames_each=options.frames,
     )
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories

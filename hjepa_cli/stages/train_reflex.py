@@ -23,6 +23,7 @@ from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.networks.reflex import Reflex
+from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.training import decay_fit, reflex_training
@@ -276,7 +277,8 @@ def teacher_plans(
             hold_steps=options.exploration_hold_steps,
             generator=explore,
         )
-    return reflex_training.follow(kind, starts, steps, sides=sides, pushes_n=pushes_n)
+    act = control_law(kind, settings.control)
+    return reflex_training.follow(kind, act, starts, steps, sides=sides, pushes_n=pushes_n)
 
 
 def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[str, Any]]:
