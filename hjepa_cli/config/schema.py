@@ -285,17 +285,12 @@ PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
 class ControlSettings:
     """``collect`` and all after it: the law that models learn and that their rivals play.
 
-    Without one it is the plant's own teacher. :mod:`hjepa_cli.core.plants.control_law` says what
-    the numbers are, force by force; ``hjepa tune-law`` finds them.
+    Without gains it is the plant's own teacher. The law is u = −K x; K is given row by row, one
+    row per force. ``hjepa tune-law`` finds both.
     """
 
-    slow_gains: tuple[Number, ...] = ()
-    fast_gains: tuple[Number, ...] = ()
-    cap_n: tuple[NotNegative, ...] = ()
-    # Of method ``ceiling``, which no actor has to learn.
-    ceiling_slow_gains: tuple[Number, ...] = ()
-    ceiling_fast_gains: tuple[Number, ...] = ()
-    ceiling_cap_n: tuple[NotNegative, ...] = ()
+    gains_n: tuple[Number, ...] = ()  # N per unit of state
+    ceiling_gains_n: tuple[Number, ...] = ()  # of method ceiling, which no actor has to learn
 
 
 @dataclasses.dataclass(frozen=True)
