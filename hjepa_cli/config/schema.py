@@ -432,13 +432,13 @@ class Settings:
         Empty lists and the zeros of an ideal link are left out: they stand for values that say the
         same, and digests of settings stay what they were before there were such settings.
         """
-        plain = typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+        values = _without_empty(plain(dataclasses.asdict(self)))
         for key in IDEAL_LINK:
-            if not plain["protocol"][key]:
-                del plain["protocol"][key]
-        if not plain["control"]:
-            del plain["control"]
-        return plain
+            if not values["protocol"][key]:
+                del values["protocol"][key]
+        if not values["control"]:
+            del values["control"]
+        return values
 
 
 @functools.cache
@@ -506,9 +506,18 @@ def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
     return flat
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items() if entry != ()}
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
-    return value
+def plain(value: Any) -> Any:
+    """Return nested values with lists for tuples, and Python's numbers for those of numpy."""
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return [plain(entry) for entry in value] if isinstance(value, tuple | list) else value
+
+
+def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_empty(entry) if isinstance(entry, dict) else entry
+        for key, entry in values.items()
+        if entry != []
+    }

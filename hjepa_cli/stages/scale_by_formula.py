@@ -139,7 +139,7 @@ class ByFormula:
         if METHODS[method].sends != "frames":
             return method
         bits = int(method.rpartition("-")[2]) * FRAME_BITS
-        delay_slots = self._law.delay_slots(self._cell.link(bits, snr_db))
+        delay_slots = self._law.asked("delay_slots", self._cell.link(bits, snr_db))
         return late(method, math.ceil(delay_slots * (1 - ROUNDING)))
 
     def _verify(self, loop: LinkRequirement) -> list[Row]:

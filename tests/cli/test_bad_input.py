@@ -77,7 +77,7 @@ def test_h_alone_means_one_level_and_with_m_or_l_the_preset_has_the_rest(shell):
 )
 def test_each_method_takes_its_own_frames(shell, method, frames, says):
     flags = ("--method", method, f"--frames={frames}")
-    refused(shell, 2, "train-encoder", *flags, says=[f"--frames {frames}: {says}"])
+    refused(shell, 2, "train-encoder", *flags, says=[f"--frames {frames}; {says}"])
 
 
 def test_an_unknown_method_names_the_others(shell):
@@ -332,8 +332,8 @@ def test_flag_without_its_value(shell):
         ("[actor]\ndropout = 1.0\n", 2, "actor.dropout"),
         ("[collect]\nsteps = 1\n", 2, "expected a whole number of at least 2"),
         ("[encoder]\nbatch_frames = 1\n", 2, "encoder.batch_frames = 1 in c.toml, line 2"),
-        ("[encoder]\nembedding = 7\n", 2, "encoder.embedding = 7; expected an even number"),
-        ("[encoder]\nembedding = 1\n", 2, "encoder.embedding = 1; expected an even number"),
+        ("[encoder]\nembedding = 7\n", 2, "embedding = 7 in c.toml, line 2; expected an even"),
+        ("[encoder]\nembedding = 1\n", 2, "embedding = 1 in c.toml, line 2; expected an even"),
         ("[protocol]\ngaps = [5, 1]\n", 2, "protocol.gaps"),
         ("[protocol]\ngaps = []\n", 2, "protocol.gaps"),
         ("[protocol]\ngaps = [0, 1]\n", 2, "protocol.gaps"),

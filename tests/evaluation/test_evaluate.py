@@ -336,7 +336,7 @@ def test_bad_requests_are_refused_before_anything_is_written(
     checkpoint: Path, tmp_path: Path
 ) -> None:
     screen = Output().screen
-    with pytest.raises(UsageError, match="unknown method 'hjepaa'; choose from hjepa, "):
+    with pytest.raises(UsageError, match=r"'hjepaa'; did you mean 'hjepa'. choose from hjepa, "):
         evaluate.run(small(methods=("hjepaa",)), screen, checkpoint=str(checkpoint))
     with pytest.raises(MissingInputError, match="nowhere"):
         evaluate.run(small(), screen, checkpoint="nowhere")

@@ -81,6 +81,7 @@ def test_a_stage_of_a_plugin_is_resumed_with_what_it_was_given(square, shell):
 
 
 def test_a_run_of_a_stage_that_is_not_there_is_named(square, shell, monkeypatch):
+    """What is missing is its plugin, as long as that may be; then the stage."""
     Path("stop").touch()
     Path("three").write_text("3")
     with pytest.raises(Interrupted):
@@ -89,3 +90,5 @@ def test_a_run_of_a_stage_that_is_not_there_is_named(square, shell, monkeypatch)
         )
     monkeypatch.setattr(STAGES, "_added", {})
     assert_one_line_error(shell("resume", "r"), 65, "'square'")
+    monkeypatch.setattr(plugins, "_sources", [])
+    assert_one_line_error(shell("resume", "r"), 2, "hint: hjepa resume r --plugin square.py")
