@@ -51,6 +51,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "scheduled": "hjepa_cli.core.radio.laws.scheduled:SCHEDULED",
     },
     "stage": {
+        "tune-law": "hjepa_cli.stages.pipeline:TUNE_LAW",
         "collect": "hjepa_cli.stages.pipeline:COLLECT",
         "train-encoder": "hjepa_cli.stages.pipeline:TRAIN_ENCODER",
         "train-hierarchy": "hjepa_cli.stages.pipeline:TRAIN_HIERARCHY",

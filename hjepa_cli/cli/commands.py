@@ -150,6 +150,7 @@ COMMANDS = (
             *("collect.frames", "out", *RESOLVED, *PARALLEL),
         ),
     ),
+    staged("tune-law", takes=("out", *RESOLVED), panel=TOOLS),
     staged(
         "train-encoder",
         takes=(

@@ -26,6 +26,7 @@ Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Candidates = Annotated[int, Meta(ge=4, le=10_000)]  # of a round of CMA-ES
 Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
 
 
@@ -197,10 +198,10 @@ class ReflexSettings:
     gradient_clip: NotNegative = 1.0
     search_devices: Count = 32  # on the true state, of gains and decay together
     search_steps: Count = 1000
-    search_candidates: Count = 48
+    search_candidates: Candidates = 48
     search_rounds: Count = 10
     fit_devices: Count = 24  # on embeddings, of a factor and the decay
-    fit_candidates: Count = 12
+    fit_candidates: Candidates = 12
     fit_rounds: Count = 3
 
 
@@ -291,6 +292,21 @@ class ControlSettings:
 
     gains_n: tuple[Number, ...] = ()  # N per unit of state
     ceiling_gains_n: tuple[Number, ...] = ()  # of method ceiling, which no actor has to learn
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneSettings:
+    """``tune-law`` searches both laws on the true state.
+
+    Errors are standard deviations in units of those that states have under the teacher.
+    """
+
+    devices: Count = 24
+    steps: Count = 2000  # scored, after the protocol's warm-up
+    candidates: Candidates = 12
+    rounds: Count = 24
+    packet_error: NotNegative = 0.05  # of the state that a packet tells
+    actor_error: NotNegative = 0.2  # of the state that the law sees, anew at every step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -417,6 +433,7 @@ class Settings:
         *("hold", "optimal", "oracle"),
     )
     control: ControlSettings = ControlSettings()
+    tune: TuneSettings = TuneSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
     actor: ActorSettings = ActorSettings()

@@ -11,6 +11,12 @@ def _stage(name: str, help: str, module: str, **more: Any) -> Stage:
     return Stage(name, help, run, plan, **more)
 
 
+TUNE_LAW = _stage(
+    "tune-law",
+    "Search a control law that holds a plant between sparse packets, for models to learn.",
+    "tune_law",
+    product="law",
+)
 COLLECT = _stage(
     "collect",
     "Simulate cart-poles under an exploring teacher and store them as a dataset.",
