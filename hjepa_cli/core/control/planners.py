@@ -44,6 +44,15 @@ def follow(
     return z
 
 
+def corrected(posterior: nn.Module, predicted: Tensor, packets: Tensor) -> Tensor:
+    """Return where devices are [n, D], from where they were predicted to be and their packets.
+
+    The posterior is a predictor that is guided by the packet, over no time and under no force.
+    """
+    z: Tensor = posterior(predicted, predicted.new_zeros(len(predicted), 0), packets)
+    return z
+
+
 class Hierarchy:
     """Plans as H-JEPA: one coarse stride at a time, filled in by the finer levels."""
 
