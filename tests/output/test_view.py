@@ -12,7 +12,7 @@ from test_evaluate import untrained
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import StrideController
-from hjepa_cli.core.control.loop import Draws, every_step, simulate
+from hjepa_cli.core.control.loop import Draws, LinkDraws, every_step, simulate
 from hjepa_cli.core.control.methods.true_state import true_state_driver
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
@@ -143,7 +143,8 @@ def pictures(steps=300, devices=2, every=10):
     random = np.random.default_rng(0)
     delivered = random.random((steps, devices)) < 0.1
     delivered[0] = True
-    link = Link(delivered, random.normal(20, 3, (steps, devices)), True, "made up")
+    snr_db = random.normal(20, 3, (steps, devices))
+    link = Link(delivered, snr_db, True, "made up", LinkDraws())
     states = np.zeros((steps, devices, 4))
     states[..., 0] = 0.02
     states[..., 2] = 0.1
@@ -159,7 +160,7 @@ def test_age_counts_from_the_last_arrival():
         age = 0
         for k, arrived in enumerate(shots.link.delivered[:, device]):
             age = 0 if arrived else age + 1
-            assert shots.age_steps(device, k) == age
+            assert shots.link.age_steps[k, device] == age
 
 
 def test_the_strip_shows_every_slot_of_the_last_while():
