@@ -416,9 +416,7 @@ def test_a_late_packet_corrects_the_filter_s_past(jitter: int) -> None:
         actions.append(forces_n[:, None] / 20.0)
 
 
-def rolled_forward(
-    draws: Draws, schedule: np.ndarray, delay: int, *, fresh: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def rolled_forward(draws: Draws, schedule: np.ndarray, delay: int, *, fresh: bool) -> np.ndarray:
     """An independent loop: equations in matrix form, forces in a list, one late packet at a time.
 
     Returns the share of steps in the band [n] under twice the teacher's law.

@@ -71,7 +71,8 @@ class Trial:
 
         def shares(act: Teacher, gaps: Floats, draws: Draws) -> Floats:
             loops = devices * len(gaps)
-            oracle = Oracle(act, kind.advance, kind.force_limit_n, loops, states=states)
+            limit_n, shape = kind.force_limit_n, kind.action_shape
+            oracle = Oracle(act, kind.advance, limit_n, loops, states=states, action_shape=shape)
             trial = cls(kind, law, draws, gaps, protocol.acceptable_score, np.ones(devices))
             return trial.shares(oracle, true_state)
 
