@@ -109,7 +109,9 @@ def tune(options: argparse.Namespace, delay: int) -> Path:
     words += ("--dataset", options.dataset) if options.dataset else ()
     where = point(options, "train-reflex", *words, delay)
     config = where.with_suffix(".toml")
-    write_text(config, as_toml(given))
+    alone = {key: given.pop(key) for key in list(given) if not isinstance(given[key], dict)}
+    lines = [f"{key} = {json.dumps(value)}\n" for key, value in alone.items()]
+    write_text(config, "".join(lines) + as_toml(given))
     named = ("--preset", options.preset, "--seed", options.seed, "--config", config)
     hjepa("train-reflex", *words, *named, "--out", where)
     return where

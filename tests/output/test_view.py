@@ -136,7 +136,7 @@ def test_a_periodic_link_loses_nothing(checkpoint):
 
 
 def test_a_late_link_shows_packets_when_they_arrive(checkpoint):
-    """Sent every 80 steps and 30 late: the newest is 30 to 109 steps old; at first none is there."""
+    """Sent every 80 steps and 30 late: the newest is 30 to 109 steps old, at first none."""
     late = {"protocol": "paper", "protocol.steps": 200, "protocol.delay_steps": 30}
     model = Model.load(checkpoint, "cpu")
     link = make_link(load_settings(flags=late), model, 2, 10.0, 0.5, 80)
