@@ -288,6 +288,11 @@ class ProtocolSettings:
         return self.warmup_steps + self.steps
 
     @property
+    def ideal_link(self) -> bool:
+        """Return whether packets come at once and every force arrives, as in the paper."""
+        return not any(getattr(self, key) for key in IDEAL_LINK)
+
+    @property
     def velocity_noise(self) -> tuple[float, ...]:
         """Return the standard deviation of what disturbs a step, one per state."""
         return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)

@@ -82,18 +82,15 @@ class Pictures:
                 picture.paste(self._panel(shot, device, k), (left, top + TITLE_PX))
         return picture
 
-    def age_steps(self, device: int, k: int) -> int:
-        """Return steps since the last packet of a device arrived; 0 where one arrives at ``k``."""
-        return k - int(np.flatnonzero(self.link.delivered[: k + 1, device])[-1])
-
     def frame(self, shot: Film, device: int, k: int) -> Pixels:
         """Return what the camera sees, uint8 [64, 128, 3]."""
         (frame,) = self._camera.render(shot.states[k, device][None])
         return frame
 
-    def age_ms(self, device: int, k: int) -> float:
-        """Return the time since the last packet of a device arrived, in milliseconds."""
-        return 1e3 * self.age_steps(device, k) * self.kind.step_s
+    def age(self, device: int, k: int) -> str:
+        """Say how long ago the newest packet was sent that the controller has of a device."""
+        steps = self.link.age_steps[k, device]
+        return "no packet" if steps < 0 else f"packet {1e3 * steps * self.kind.step_s:.0f} ms old"
 
     def sketch(self, shot: Film, device: int, k: int) -> list[Floats]:
         """Return the believed state as lines over a frame, in its pixels."""
@@ -111,8 +108,8 @@ class Pictures:
     def _panel(self, shot: Film, device: int, k: int) -> Image.Image:
         panel = Image.new("RGB", PANEL_PX, PAPER)
         draw = ImageDraw.Draw(panel)
-        age_ms, snr_db = self.age_ms(device, k), self.link.snr_db[k, device]
-        caption = f"device {device}   packet {age_ms:.0f} ms old   SNR {snr_db:.0f} dB"
+        age, snr_db = self.age(device, k), self.link.snr_db[k, device]
+        caption = f"device {device}   {age}   SNR {snr_db:.0f} dB"
         draw.text((0, 0), caption, INK, TEXT)
         scene = Image.fromarray(self.frame(shot, device, k))
         scene = scene.resize((WIDTH_PX * SCALE, HEIGHT_PX * SCALE), Image.Resampling.BOX)

@@ -3,6 +3,7 @@
 from typing import Any
 
 from hjepa_cli.core.control.force_error import WINDOWS
+from hjepa_cli.core.control.link import described
 from hjepa_cli.core.evaluation.protocol import BESIDE
 from hjepa_cli.output.screen import Screen, described_steps, tolerance
 
@@ -68,7 +69,7 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
         return
     first = next(iter(entries.values()))
     windows = [f"{start}-{end}" for start, end in WINDOWS]
-    where = f"{result['plant']}, seed {result['seed']}"
+    where = f"{result['plant']}, seed {result['seed']}{described(result.get('link', {}))}"
     errors, tolerances, scores = [], [], []
     for name, entry in entries.items():
         nmae = (_number(entry["nmae_windows"].get(window), 3) for window in windows)

@@ -249,6 +249,28 @@ def test_a_bandwidth_is_more_than_nothing_and_that_of_a_radio(shell, command, va
     refused(shell, 2, command, f"--bandwidth-mhz={value}", says=says)
 
 
+@pytest.mark.parametrize("command", ["eval", "scale", "view"])
+@pytest.mark.parametrize(
+    ("flag", "value", "says"),
+    [
+        ("--delay-steps", "257", "a whole number from 0 to 256"),  # more is not remembered
+        ("--delay-steps", "-1", "a whole number from 0 to 256"),
+        ("--jitter-steps", "2.5", "a whole number from 0 to 256"),
+        ("--downlink-loss", "1", "at least 0 and less than 1"),
+    ],
+)
+def test_links_that_cannot_be(shell, command, flag, value, says):
+    refused(shell, 2, command, flag, value, says=[flag, says])
+
+
+def test_packets_that_come_when_all_is_over(shell, tmp_path):
+    (tmp_path / "short.toml").write_text("[protocol]\nwarmup_steps = 0\nsteps = 300\n")
+    late = ("--delay-steps", "200", "--jitter-steps", "100")
+    says = ["300 steps late", "there are 300 steps", "--delay-steps"]
+    refused(shell, 2, "scale", *late, "--config", "short.toml", says=says)
+    assert shell("scale", "--delay-steps", "200", "--config", "short.toml", "--dry-run").code != 70
+
+
 def test_a_spread_of_one_would_make_masses_vanish(shell):
     refused(shell, 2, "eval", "--plant-spread", "1", says=["--plant-spread", "less than 1"])
 

@@ -323,12 +323,18 @@ def test_a_search_finds_the_top_of_a_hill() -> None:
     np.testing.assert_allclose(found, top, atol=0.05)
 
 
+@pytest.mark.parametrize("late", [{}, {"delay_steps": 5, "jitter_steps": 4}], ids=["ideal", "late"])
 @pytest.mark.parametrize("name", ["desktop", "quadrotor"])
-def test_searches_move_devices_as_the_loop_does(name: str) -> None:
+def test_searches_move_devices_as_the_loop_does(name: str, late: dict[str, int]) -> None:
     """Pymunk and the exact equations are not the same to the last bit, so a step may differ."""
     kind = plant(name)
-    options = load_settings(flags={"plant": name, "protocol": "paper"}).protocol
-    trial = Trial.make(kind, kind.teacher(), options, devices=3, steps=60, seed=0)
+    ideal = load_settings(flags={"plant": name, "protocol": "paper"}).protocol
+    options = dataclasses.replace(ideal, **late)
+    trial, on_time = (
+        Trial.make(kind, kind.teacher(), one, devices=3, steps=60, seed=0)
+        for one in (options, ideal)
+    )
+    assert np.array_equal(trial.teacher, on_time.teacher)  # who is never late
     law_n, taus = gains_at_rest(kind.teacher(), len(kind.state_names)), (4.0, 20.0)
     found = decay_fit.shares_of_laws(trial, np.stack([law_n, 2 * law_n]), np.array(taus))
     for number, tau in enumerate(taus):

@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats, Integers
-from hjepa_cli.core.control.link import AHEAD_STEPS, SentForces
+from hjepa_cli.core.control.link import AHEAD_STEPS, REMEMBERED_STEPS, SentForces
 from hjepa_cli.core.networks.planning import Planner, Reaction
-
-REMEMBERED_STEPS = 512  # of forces that were sent: no packet may be later
+from hjepa_cli.errors import UsageError
 
 
 class _Strides:
@@ -103,6 +102,12 @@ class StrideController(_Strides):
         """Move late packets on to the present."""
         if ages is None or not ages.any():
             return packets
+        if not hasattr(self._planner, "follow"):  # of a plugin
+            raise UsageError(
+                f"packets come late, and {type(self._planner).__name__} cannot move an embedding "
+                "on under given forces: it has no follow(z, forces_n, ages)",
+                hint="write one (docs/plugins.md), or leave out --delay-steps and --jitter-steps",
+            )
         forces_n = self._sent.since(np.flatnonzero(delivered), ages)
         return self._planner.follow(packets, torch.from_numpy(forces_n).float(), ages)
 
@@ -171,6 +176,8 @@ class ReflexController(_Strides):
 class LastForce:
     """Acts on each packet, then keeps that force, lets it fade, or applies none.
 
+    Packets are taken for fresh, however late: without a prediction nothing better is known.
+
     At age j it plays clip(s · C(packet) · e^(−j/τ)). With the teacher as actor and a packet at
     every step this is the optimal controller.
 
@@ -204,11 +211,8 @@ class LastForce:
         self._played_n = self._forces_n = np.zeros((devices, *action_shape))
 
     @torch.inference_mode()
-    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
-        """Return the forces of one step [n, *A]; 0 N before a device's first packet.
-
-        Whatever their ages, packets are taken for fresh: it cannot know better.
-        """
+    def act(self, delivered: Bools, packets: Any) -> Floats:
+        """Return the forces of one step [n, *A]; 0 N before a device's first packet."""
         if packets is not None:
             forces_n = self._actor(packets)
             fresh_n = forces_n.float().cpu().numpy() if isinstance(forces_n, Tensor) else forces_n

@@ -15,6 +15,7 @@ import numpy as np
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.core.control.controllers import LastForce, Oracle
+from hjepa_cli.core.control.link import InFlight
 from hjepa_cli.core.control.loop import STATE_LIMIT, Draws, Sensor, gap_schedule, simulate
 from hjepa_cli.core.control.sensors import true_state
 from hjepa_cli.core.plants.linear import gains_at_rest
@@ -68,15 +69,16 @@ class Trial:
         draws = Draws.make(nominal, devices, seed + SEARCH_SEED)
         states = len(kind.state_names)
 
-        def shares(act: Teacher, gaps: Floats) -> Floats:
+        def shares(act: Teacher, gaps: Floats, draws: Draws) -> Floats:
             loops = devices * len(gaps)
-            oracle = Oracle(act, kind.advance, kind.force_limit_n, loops, states=states)
+            limit_n, shape = kind.force_limit_n, kind.action_shape
+            oracle = Oracle(act, kind.advance, limit_n, loops, states=states, action_shape=shape)
             trial = cls(kind, law, draws, gaps, protocol.acceptable_score, np.ones(devices))
             return trial.shares(oracle, true_state)
 
         grid = np.array(protocol.gaps, float)
-        (teacher,) = shares(kind.teacher(), np.ones(1))
-        scores = ratio(shares(law, grid), teacher)
+        (teacher,) = shares(kind.teacher(), np.ones(1), draws.on_device)
+        scores = ratio(shares(law, grid, draws), teacher)
         tolerated = float(first_crossing(grid, scores, protocol.acceptable_score, log=False))
         tolerated = float(np.clip(tolerated, grid[min(1, len(grid) - 1)], grid[-1]))
         gaps = np.clip(np.array(around) * tolerated, 1.0, steps)
@@ -153,7 +155,8 @@ def search_law(
 def shares_of_laws(trial: Trial, gains_n: Floats, tau_steps: Floats) -> Floats:
     """Return :meth:`Trial.shares` of laws K [C, m, S] and τ [C] on the true state.
 
-    The plant's exact equations move many candidates at once.
+    The plant's exact equations move many candidates at once. Packets are late as the draws say; no
+    force is lost.
     """
     kind, draws, schedules = trial.kind, trial.draws, trial.schedules
     count, shape = len(gains_n), (len(gains_n), len(trial.gaps), draws.devices)
@@ -163,10 +166,16 @@ def shares_of_laws(trial: Trial, gains_n: Floats, tau_steps: Floats) -> Floats:
     initial = np.broadcast_to(draws.initial, (*shape, draws.initial.shape[1]))
     states = kind.advance(initial, forces_n.reshape(action))
     inside = np.zeros(shape)
+    link = draws.link.tiled(len(trial.gaps))
+    in_flight = InFlight(link.delay_steps, link.extra_steps)
     for k in range(draws.steps):
         gap, device = np.nonzero(schedules[:, k])
-        if len(gap):
-            forces_n[:, gap, device] = -np.einsum("cms,cps->cpm", gains_n, states[:, gap, device])
+        packets = states[:, gap, device].swapaxes(0, 1)  # [packets, C, S]
+        arrived, packets, _ = in_flight.pass_on(schedules[:, k].ravel(), packets)
+        if packets is not None:
+            gap, device = np.nonzero(arrived.reshape(shape[1:]))
+            seen = packets.swapaxes(0, 1)
+            forces_n[:, gap, device] = -np.einsum("cms,cps->cpm", gains_n, seen)
         if k >= draws.warmup_steps:
             inside += kind.in_band(states)
         applied_n = np.clip(forces_n, -kind.force_limit_n, kind.force_limit_n)
