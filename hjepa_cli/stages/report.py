@@ -267,7 +267,7 @@ def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Pat
 
 
 FIGURES: dict[str, Callable[..., Figures]] = {
-    **dict.fromkeys(("train-encoder", "train-hierarchy", "train-reflex", "train-fusion"), training_figures),
+    **{stage: training_figures for stage in STAGES if stage.startswith("train-")},
     "eval": eval_figures,
     "scale": scale_figures,
 }

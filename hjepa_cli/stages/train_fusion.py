@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import nn
 
-from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.planners import corrected
@@ -25,8 +24,8 @@ from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_fusion
 from hjepa_cli.stages.embedding_training import begin, fit_network, save
-from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.inputs import open_dataset
+from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.train_reflex import open_model
 from hjepa_cli.stages.training import (
     Drawn,
@@ -130,7 +129,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
 
     modules["before"] = copy.deepcopy(modules["posterior"])
     for number in range(options.rounds):
-        train_round(run, model, number)
+        train_round(run, modules, model, number)
     del modules["before"]
     heard = listen(model, modules["posterior"], settings, options.rounds)
     save(run, modules, metadata)
@@ -144,12 +143,12 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     return result
 
 
-def train_round(run: TrainingRun, model: Model, number: int) -> None:
+def train_round(run: TrainingRun, modules: nn.ModuleDict, model: Model, number: int) -> None:
     """Train on loops that the posterior drives as it is before this round.
 
     That one is kept beside it, since a round that is taken up needs the same loops again.
     """
-    settings, options, modules = run.settings, run.settings.fusion, model.networks
+    settings, options = run.settings, run.settings.fusion
     modules["before"].load_state_dict(modules["posterior"].state_dict())
     stream = generator(settings.seed, STREAM, number)
     optimiser = Optimiser(

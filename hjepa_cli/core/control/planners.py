@@ -75,6 +75,12 @@ class Hierarchy:
             )
         return self._model.force_limit_n * actions, z_next
 
+    def correct(self, predicted: Tensor, packets: Tensor) -> Tensor:
+        """Return where devices are [n, D], by the model's posterior: see :func:`corrected`."""
+        with self._model.autocast():
+            z = corrected(self._model.networks["posterior"], predicted, packets)
+        return z.to(packets.dtype)
+
     def follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:
         """Move embeddings on, by P^H in strides and by the predictor of stride 1 for the rest."""
         networks = self._model.networks

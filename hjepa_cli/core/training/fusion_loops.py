@@ -6,14 +6,13 @@ it drives itself, round after round (data-set aggregation, Ross et al., AISTATS 
 
 import dataclasses
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ConditionSettings, Settings
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.control.controllers import StrideController
+from hjepa_cli.core.control.controllers import FusingController
 from hjepa_cli.core.control.drivers import coder_of
 from hjepa_cli.core.control.loop import Draws, simulate
 from hjepa_cli.core.control.planners import Hierarchy, corrected
@@ -46,9 +45,7 @@ def listen(model: Model, posterior: nn.Module, settings: Settings, number: int) 
     Packets of the first half are also quantised as the settings say. The loops of each ``number``
     are others; gaps differ from device to device and packet to packet.
     """
-    halves = [
-        _listen(model, posterior, settings, number, exact=exact) for exact in (False, True)
-    ]
+    halves = [_listen(model, posterior, settings, number, exact=exact) for exact in (False, True)]
     names = [field.name for field in dataclasses.fields(Heard)]
     return Heard(*(torch.cat([getattr(half, name) for half in halves]) for name in names))
 
@@ -61,8 +58,9 @@ def _listen(
     seed = settings.seed + SEARCH_SEED + 2 * number + exact
     draws = Draws.make(protocol, options.devices, seed)
     # A device's mean gap lies, by its logarithm, evenly between short gaps and those of the middle.
-    ends = np.log([max(gaps[min(1, len(gaps) - 1)] / 2, 1.0), gaps[len(gaps) // 2]])
-    rates = np.exp(-generator(seed, GAP_KEY).uniform(*ends, options.devices))
+    shortest, longest = max(gaps[min(1, len(gaps) - 1)] / 2, 1.0), gaps[len(gaps) // 2]
+    share = generator(seed, GAP_KEY).uniform(size=options.devices)
+    rates = 1 / (shortest * (longest / shortest) ** share)
     delivered = draws.delivery < rates
     delivered[0] = True
 
@@ -82,7 +80,7 @@ def _listen(
         return corrected(posterior, predicted, packets)
 
     shape = model.action_shape
-    controller = StrideController(
+    controller = FusingController(
         Hierarchy(model), options.devices, action_shape=shape, correct=correct
     )
     plant = actual_plant(settings.plant, conditions)

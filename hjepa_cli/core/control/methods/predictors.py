@@ -15,7 +15,7 @@ from hjepa_cli.core.style import Style
 
 if TYPE_CHECKING:
     from hjepa_cli.config.schema import Settings
-    from hjepa_cli.core.control.controllers import Correct, StrideController
+    from hjepa_cli.core.control.controllers import StrideController
     from hjepa_cli.core.control.drivers import Driver
     from hjepa_cli.core.networks.model import Model
     from hjepa_cli.core.networks.planning import Planner
@@ -34,12 +34,17 @@ def predictor(
     """
 
     def build(settings: Settings, model: Model) -> Driver:
+        from hjepa_cli.core.control.controllers import FusingController
         from hjepa_cli.core.control.disagreement import TwoLevels
         from hjepa_cli.core.control.drivers import embedding_driver
-        from hjepa_cli.core.control.planners import OnePredictor, corrected
+        from hjepa_cli.core.control.planners import OnePredictor
 
-        correct = functools.partial(corrected, model.networks["posterior"]) if fused else None
-        drives = _strides(model, planner(model), correct)
+        made: Any = planner(model)
+        drives = _strides(model, made)
+        if fused:
+            drives = functools.partial(
+                FusingController, made, action_shape=model.action_shape, correct=made.correct
+            )
 
         def two_levels(devices: int) -> TwoLevels:
             step = OnePredictor(model, model.networks["flat"], 1).step
@@ -52,13 +57,10 @@ def predictor(
     return Method(name, "embedding", build, planner=planner, **about)
 
 
-def _strides(
-    model: Model, planner: Planner, correct: Correct | None
-) -> Callable[[int], StrideController]:
+def _strides(model: Model, planner: Planner) -> Callable[[int], StrideController]:
     from hjepa_cli.core.control.controllers import StrideController
 
-    shape = model.action_shape
-    return functools.partial(StrideController, planner, action_shape=shape, correct=correct)
+    return functools.partial(StrideController, planner, action_shape=model.action_shape)
 
 
 def _hierarchy(model: Model) -> Planner:
