@@ -27,7 +27,7 @@ FORMATS = (".gif", ".mp4")
 SCALE = 2  # a frame's pixel is so many of the picture
 PANEL_PX = (WIDTH_PX * SCALE, HEIGHT_PX * SCALE + 16 + 14)  # text above, strip below
 MARGIN_PX, TITLE_PX, HEADER_PX = 8, 20, 34
-LEAST_WIDTH_PX = 600  # for the legend
+LEAST_WIDTH_PX = 600  # for the notes at the top
 TEXT, NAME = font(12), font(14)  # below 12 px, Pillow's letters swallow the blanks
 ARRIVED, LOST = (0, 158, 115), (213, 94, 0)  # safe for colour-blind readers
 DASH_PX = 7
@@ -52,7 +52,10 @@ class Pictures:
         self.steps = list(range(0, len(link.delivered), every))
         self._camera = camera
         self.devices = link.delivered.shape[1]
-        width = max(self.devices * (PANEL_PX[0] + MARGIN_PX) + MARGIN_PX, LEAST_WIDTH_PX)
+        self._legend = "dashed: what the controller believes; bar: packet arrived"
+        self._legend += "; tick: lost" * link.sends_always + link.late.replace(",", ";", 1)
+        panels = self.devices * (PANEL_PX[0] + MARGIN_PX) + MARGIN_PX
+        width = max(panels, LEAST_WIDTH_PX, int(TEXT.getlength(self._legend)) + 2 * MARGIN_PX)
         height = len(films) * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX
         self.size_px = (width + width % 2, height + height % 2)  # MP4 wants even sizes
 
@@ -68,9 +71,7 @@ class Pictures:
         draw = ImageDraw.Draw(picture)
         clock = f"t = {1e3 * k * self.kind.step_s:.0f} ms   {self.link.label}"
         draw.text((MARGIN_PX, 3), clock, FAINT, TEXT)
-        legend = "dashed: what the controller believes; bar: packet arrived"
-        legend += "; tick: lost" if self.link.sends_always else ""
-        draw.text((MARGIN_PX, 19), legend, FAINT, TEXT)
+        draw.text((MARGIN_PX, 19), self._legend, FAINT, TEXT)
         for row, shot in enumerate(self.films):
             top = HEADER_PX + MARGIN_PX + row * (PANEL_PX[1] + TITLE_PX + MARGIN_PX)
             score = shot.score[: k + 1].mean()

@@ -19,6 +19,7 @@ class Link:
     sends_always: bool  # in every slot, so that a packet that does not arrive was lost
     label: str  # one line for people
     draws: LinkDraws  # how late they are
+    late: str = ""  # the same in words, after a comma
 
     @property
     def delivered(self) -> Bools:

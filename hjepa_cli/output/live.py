@@ -35,7 +35,7 @@ def terminal_picture(pictures: Pictures, k: int, width: int, height: int) -> Gro
     columns = panel_columns(pictures, width, height)
     nothing = "none did" if pictures.link.sends_always else "none sent"
     parts: list[Text | Table] = [
-        Text(pictures.link.label, style="dim", no_wrap=True),
+        Text(pictures.link.label + pictures.link.late, style="dim", no_wrap=True),
         Text(f"black: what the controller believes; █ packet arrived, · {nothing}", style="dim",
              no_wrap=True),
     ]  # fmt: skip

@@ -131,7 +131,7 @@ def run(
         raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
     models = open_viewable(settings, screen, checkpoint)
     link = make_link(settings, models.model, devices, snr_db, delivery, gap_steps)
-    screen.say(link.label)
+    screen.say(link.label + link.late)
     probe = fit_probe(settings, models.model, screen)
     films = [film(name, settings, models.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.total_steps // 100, 1)
@@ -227,7 +227,7 @@ def make_link(
     if gap_steps is not None:
         schedule = gap_schedule(gap_steps, steps, devices)
         label = f"a packet every {gap_steps:g} steps, SNR {snr_db:g} dB by power control"
-        return Link(schedule, np.full((steps, devices), snr_db), False, label + late, draws)
+        return Link(schedule, np.full((steps, devices), snr_db), False, label, draws, late)
     streams = [generator(settings.seed, FADING_KEY, device) for device in range(devices)]
     gains = np.stack([rayleigh_power_gains(stream, steps) for stream in streams], axis=1)
     delivered = gains >= -np.log(delivery)
@@ -239,7 +239,7 @@ def make_link(
         f"Rayleigh fading, mean SNR {snr_db:g} dB, packets arrive with p = {delivery:g}: "
         f"{sharing} devices share {settings.radio.bandwidth_hz / 1e6:g} MHz"
     )
-    return Link(delivered, snr_db + 10 * np.log10(gains), True, label + late, draws)
+    return Link(delivered, snr_db + 10 * np.log10(gains), True, label, draws, late)
 
 
 def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:

@@ -144,7 +144,7 @@ def test_a_late_link_shows_packets_when_they_arrive(checkpoint):
     assert np.flatnonzero(link.delivered[:, 0]).tolist() == [30, 110, 190]
     expected = [-1] * 30 + [30 + k for k in range(80)] + [30 + k for k in range(80)]
     assert link.age_steps[:190, 0].tolist() == expected
-    assert link.label.endswith(", packets 30 steps late")
+    assert link.late == ", packets 30 steps late"
     states = np.zeros((200, 2, 4))
     film = Film("hjepa", states, states, np.ones((200, 2), bool))
     kind = plant("desktop")
