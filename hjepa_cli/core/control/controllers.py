@@ -173,11 +173,14 @@ class FusingController(StrideController):
         rows, predicted = np.flatnonzero(delivered), packets.clone()
         known = self._heard[rows] & (self._anchor_ages[rows] <= REMEMBERED_STEPS)
         if known.any():
-            since, at = self._anchor_ages[rows[known]], torch.from_numpy(rows[known])
-            forces_n = torch.from_numpy(self._sent.since(rows[known], since)).float()
-            predicted[torch.from_numpy(known)] = self._planner.follow(
-                self._anchors[at], forces_n, since - ages[known]
-            )
+            old, at = rows[known], torch.from_numpy(rows[known])
+            if ages.any():
+                since = self._anchor_ages[old]
+                forces_n = torch.from_numpy(self._sent.since(old, since)).float()
+                moved = self._planner.follow(self._anchors[at], forces_n, since - ages[known])
+            else:  # the stride that is being played leads there
+                moved = self._planner.follow(self._starts[at], self._forces_n[at], self._phase[old])
+            predicted[torch.from_numpy(known)] = moved
         corrected = self._correct(predicted, packets)
         self._anchors[torch.from_numpy(rows)], self._anchor_ages[rows] = corrected, ages
         return super()._take(delivered, corrected, ages)
