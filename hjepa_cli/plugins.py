@@ -56,6 +56,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "train-encoder": "hjepa_cli.stages.pipeline:TRAIN_ENCODER",
         "train-hierarchy": "hjepa_cli.stages.pipeline:TRAIN_HIERARCHY",
         "train-reflex": "hjepa_cli.stages.pipeline:TRAIN_REFLEX",
+        "train-fusion": "hjepa_cli.stages.pipeline:TRAIN_FUSION",
         "eval": "hjepa_cli.stages.pipeline:EVAL",
         "scale": "hjepa_cli.stages.pipeline:SCALE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
@@ -68,6 +69,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "method": {
         "hjepa": f"{_CONTROL}.methods.predictors:HJEPA",
+        "hjepa-fused": f"{_CONTROL}.methods.predictors:HJEPA_FUSED",
         **{f"ts-jepa-{h}": f"{_CONTROL}.methods.predictors:TS_JEPA" for h in range(1, 6)},
         "supervised-2": f"{_CONTROL}.methods.raw_frames:SUPERVISED_2",
         "supervised-4": f"{_CONTROL}.methods.raw_frames:SUPERVISED_4",

@@ -171,6 +171,12 @@ COMMANDS = (
         takes=("dataset", "checkpoint", "out", *COMPUTED),
     ),
     staged(
+        "train-fusion",
+        further="Conditions are those of [conditions] and payload in --config FILE.toml.",
+        takes=("protocol.payload", "dataset", "checkpoint", "out", *COMPUTED),
+        panel=TOOLS,
+    ),
+    staged(
         "eval",
         takes=(
             *(*MEASURED, "remeasure", "figure", "checkpoint", "dataset:clean", "out"),

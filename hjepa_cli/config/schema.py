@@ -206,6 +206,23 @@ class ReflexSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class FusionSettings:
+    """``train-fusion`` learns what to make of packets that are not quite right.
+
+    They are those of devices in the settings' [conditions], quantised as [protocol] says.
+    """
+
+    rounds: Count = 12  # of loops, then training on them
+    devices: Count = 32  # in the conditions, and as many in none
+    loop_steps: Count = 700
+    steps: Count = 300  # of training in a round
+    batch: Count = 256
+    learning_rate: NotNegative = 1e-3
+    weight_decay: NotNegative = 1e-2
+    gradient_clip: NotNegative = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
     """``eval`` and ``scale`` follow this closed-loop protocol."""
 
@@ -439,6 +456,7 @@ class Settings:
     )
     control: ControlSettings = ControlSettings()
     tune: TuneSettings = TuneSettings()
+    fusion: FusionSettings = FusionSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
     actor: ActorSettings = ActorSettings()

@@ -51,6 +51,17 @@ def show_reflex(result: dict[str, Any], screen: Screen) -> None:
     )
 
 
+def show_fusion(result: dict[str, Any], screen: Screen) -> None:
+    """Print how far predictions, packets and what is made of both are from the truth."""
+    distances = result["distances"]
+    screen.table(
+        f"distance 1 − cos from clean embeddings, over {result['packets']} packets of loops that "
+        "training did not see",
+        [*distances],
+        [[f"{value:.5f}" for value in distances.values()]],
+    )
+
+
 def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
     """Print the tables of an evaluation: what each method does, and its score over the gap."""
     entries = result["methods"]

@@ -28,7 +28,7 @@ from hjepa_cli.storage import runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 from hjepa_cli.storage.zoo import CURVES_FILE
 
-TRAINING = ("train-encoder", "train-hierarchy", "train-reflex")
+TRAINING = ("train-encoder", "train-hierarchy", "train-reflex", "train-fusion")
 
 
 @dataclasses.dataclass(frozen=True)

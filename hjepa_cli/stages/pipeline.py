@@ -45,6 +45,13 @@ TRAIN_REFLEX = _stage(
     inputs=("dataset", "checkpoint"),
     product="checkpoint",
 )
+TRAIN_FUSION = _stage(
+    "train-fusion",
+    "Train what a hierarchy makes of packets that are not quite right, in noise or few bits.",
+    "train_fusion",
+    inputs=("dataset", "checkpoint"),
+    product="checkpoint",
+)
 EVAL = _stage(
     "eval",
     "Measure prediction error, control score and tolerated losses of each method.",

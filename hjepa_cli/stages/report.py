@@ -24,7 +24,7 @@ Result = dict[str, Any]
 Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
-STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale")
+STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "train-fusion", "eval", "scale")
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 SMOKE = "smoke"
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
@@ -267,7 +267,7 @@ def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Pat
 
 
 FIGURES: dict[str, Callable[..., Figures]] = {
-    **dict.fromkeys(("train-encoder", "train-hierarchy", "train-reflex"), training_figures),
+    **{stage: training_figures for stage in STAGES if stage.startswith("train-")},
     "eval": eval_figures,
     "scale": scale_figures,
 }

@@ -135,6 +135,57 @@ class StrideController(_Strides):
         return self._starts, self._z, (self._phase - 1) / self._stride
 
 
+class FusingController(StrideController):
+    """Plays a planner from what packets make of its own predictions: a filter in latent space.
+
+    Args:
+        planner: what it predicts and plays with.
+        devices: n.
+        correct: maps predicted embeddings and those of packets [m, D] to what is taken for true.
+        action_shape: A, of the plant.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        devices: int,
+        *,
+        correct: Callable[[Tensor, Tensor], Tensor],
+        action_shape: tuple[int, ...] = (),
+    ) -> None:
+        super().__init__(planner, devices, action_shape=action_shape)
+        self._correct, self._anchors = correct, self._z
+        self._anchor_ages = np.zeros(devices, dtype=np.int64)
+
+    def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
+        """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D]."""
+        if ages is None:  # the forces that were sent are remembered for packets on time, too
+            ages = np.zeros(int(delivered.sum()), dtype=np.int64)
+        played = super().act(delivered, packets, ages)
+        self._anchor_ages += 1
+        return played
+
+    def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
+        """Correct what was predicted for the moment of each packet, then move on to the present."""
+        assert ages is not None
+        if not self._anchors.shape[1]:
+            self._anchors = packets.new_zeros(len(delivered), packets.shape[1])
+        rows, predicted = np.flatnonzero(delivered), packets.clone()
+        known = self._heard[rows] & (self._anchor_ages[rows] <= REMEMBERED_STEPS)
+        if known.any():
+            old, at = rows[known], torch.from_numpy(rows[known])
+            if ages.any():
+                since = self._anchor_ages[old]
+                forces_n = torch.from_numpy(self._sent.since(old, since)).float()
+                moved = self._planner.follow(self._anchors[at], forces_n, since - ages[known])
+            else:  # the stride that is being played leads there
+                moved = self._planner.follow(self._starts[at], self._forces_n[at], self._phase[old])
+            predicted[torch.from_numpy(known)] = moved
+        corrected = self._correct(predicted, packets)
+        self._anchors[torch.from_numpy(rows)], self._anchor_ages[rows] = corrected, ages
+        return super()._take(delivered, corrected, ages)
+
+
 class ReflexController(_Strides):
     """Plays a reaction for n devices, to the last packet, its age and the forces since."""
 

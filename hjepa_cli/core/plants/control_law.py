@@ -39,7 +39,7 @@ class LinearLaw:
         # A sum of products, not a matrix product: a state's force must not depend on its batch.
         forces_n = -(self.gains_n * finite(states, "states")[..., None, :]).sum(axis=-1)
         forces_n = forces_n.clip(-self.force_limit_n, self.force_limit_n)
-        return np.asarray(forces_n.reshape(*forces_n.shape[:-1], *self.action_shape))
+        return np.asarray(forces_n.reshape((*forces_n.shape[:-1], *self.action_shape)))
 
 
 def control_law(kind: System, control: ControlSettings) -> Teacher:
