@@ -227,10 +227,9 @@ class ReflexController(_Strides):
 class LastForce:
     """Acts on each packet, then keeps that force, lets it fade, or applies none.
 
-    Packets are taken for fresh, however late: without a prediction nothing better is known.
-
     At age j it plays clip(s · C(packet) · e^(−j/τ)). With the teacher as actor and a packet at
-    every step this is the optimal controller.
+    every step this is the optimal controller. A late packet is taken for fresh: who predicts
+    nothing knows nothing better.
 
     Args:
         actor: packets [m, ...] → forces_n [m, *A].
