@@ -5,7 +5,6 @@ at once.
 """
 
 import contextlib
-import io
 import os
 import shlex
 import sys
@@ -17,11 +16,11 @@ from typing import Any, NoReturn, TextIO
 from typer.main import get_command
 
 from hjepa_cli.cli.builder import build
-from hjepa_cli.cli.execution import PipeClosed
 from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.errors import DataError, HjepaError, Interrupted, StorageError, UsageError
 from hjepa_cli.output.screen import Screen, one_line
+from hjepa_cli.output.streams import Lasting, PipeClosed, lasting_streams
 from hjepa_cli.plugins import blamed, in_force, load_file
 
 
@@ -31,17 +30,27 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     The arguments are those of the process, without the program's name, unless others are given.
     """
     argv = list(sys.argv[1:] if arguments is None else arguments)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # an ASCII-only terminal gets "?", not a crash
-            stream.reconfigure(errors="replace")
-    errors = sys.stderr
     with contextlib.ExitStack() as streams:
+        out, errors = streams.enter_context(lasting_streams()), sys.stderr
         if torchrun.follows():
             nowhere = streams.enter_context(open(os.devnull, "w"))
             for redirect in (contextlib.redirect_stdout, contextlib.redirect_stderr):
                 streams.enter_context(redirect(nowhere))
         code = _run_command(argv, errors)
+        code = _delivered(out, code)
     sys.exit(code)
+
+
+def _delivered(out: Lasting | None, code: int) -> int:
+    """Return an exit code, that of a disk that refused where results did not get out."""
+    with contextlib.suppress(PipeClosed):
+        sys.stdout.flush()
+    if out is None or out.lost is None or code != 0:
+        return code
+    if not isinstance(out.lost, BrokenPipeError):
+        reason = f"cannot write results to stdout: {out.lost.strerror}"
+        Screen().error(reason, "free some disk space or write elsewhere; files of it are complete")
+    return StorageError.exit_code
 
 
 def _run_command(argv: list[str], errors: TextIO) -> int:
@@ -57,8 +66,7 @@ def _run_command(argv: list[str], errors: TextIO) -> int:
         if "--debug" in argv or os.environ.get("HJEPA_DEBUG", "0") not in ("", "0"):
             traceback.print_exc()
         failure = _expected(error, argv)
-    if isinstance(failure, PipeClosed):  # keep Python from complaining about its last flush
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if isinstance(failure, PipeClosed):
         return failure.exit_code
     if torchrun.follows() and not isinstance(failure, torchrun.OneOfSeveral):
         return failure.exit_code  # the process that leads says the same
@@ -66,7 +74,8 @@ def _run_command(argv: list[str], errors: TextIO) -> int:
     screen.error(failure.message, failure.hint)
     if screen.json:
         message, hint = one_line(failure.message), failure.hint
-        screen.emit({"error": {"code": failure.exit_code, "message": message, "hint": hint}})
+        with contextlib.suppress(PipeClosed):
+            screen.emit({"error": {"code": failure.exit_code, "message": message, "hint": hint}})
     return failure.exit_code
 
 

@@ -16,15 +16,9 @@ from hjepa_cli.compute.interrupts import exit_code, sigterm_raises
 from hjepa_cli.config.checks import resolve
 from hjepa_cli.config.schema import declared
 from hjepa_cli.config.settings import locate
-from hjepa_cli.errors import HjepaError, Interrupted, StorageError, Unsealed, UsageError
+from hjepa_cli.errors import Interrupted, Unsealed, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan
-
-
-class PipeClosed(HjepaError):
-    """Whoever read our output has gone, as in ``hjepa scale | head -1``: we end without a word."""
-
-    exit_code = StorageError.exit_code
 
 
 def execute(command: Command, given: Given) -> None:
@@ -101,5 +95,3 @@ def _guard(screen: Screen) -> Iterator[None]:
         raise Interrupted(
             "interrupted", hint="run the same command again", code=exit_code(error)
         ) from None
-    except BrokenPipeError:
-        raise PipeClosed("output closed") from None
