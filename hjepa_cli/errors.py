@@ -5,6 +5,8 @@ optional hint (the command to run next); it never shows a traceback. Codes follo
 """
 
 import difflib
+import os
+import shlex
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 
@@ -51,6 +53,20 @@ class MissingInputError(HjepaError):
     exit_code = 66
 
 
+def shell(words: Iterable[object]) -> str:
+    """Return a command as a shell takes it back, in one line and whatever bytes are in a path."""
+    return " ".join(map(_quoted, map(str, words)))
+
+
+def _quoted(word: str) -> str:
+    if word.isprintable():
+        return shlex.quote(word)
+    plain = (
+        chr(b) if 32 <= b < 127 and b not in b"'\\" else f"\\x{b:02x}" for b in os.fsencode(word)
+    )
+    return f"$'{''.join(plain)}'"
+
+
 def meant(name: object, names: Iterable[str]) -> str:
     """Ask whether the nearest of some names was meant, for a message; ``""`` where none is near."""
     near = difflib.get_close_matches(str(name), names, n=1)
@@ -76,6 +92,12 @@ class NumericalError(HjepaError):
     exit_code = 70
 
 
+class OutOfMemory(HjepaError):
+    """What was asked for does not fit into memory."""
+
+    exit_code = 70
+
+
 class StorageError(HjepaError):
     """The disk refused: not writable, full, I/O error."""
 
@@ -96,6 +118,10 @@ class LockedError(HjepaError):
 
 class Unsealed(UserWarning):
     """A file of an older version has no seal: nobody can tell whether it was changed."""
+
+
+class Unlocked(UserWarning):
+    """A file system has no locks: nobody can tell whether another process works in a directory."""
 
 
 class Interrupted(HjepaError):

@@ -6,7 +6,6 @@ at once.
 
 import contextlib
 import os
-import shlex
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -16,9 +15,17 @@ from typing import Any, NoReturn, TextIO
 from typer.main import get_command
 
 from hjepa_cli.cli.builder import build
-from hjepa_cli.compute import torchrun
+from hjepa_cli.compute import memory, torchrun
 from hjepa_cli.compute.interrupts import exit_code
-from hjepa_cli.errors import DataError, HjepaError, Interrupted, StorageError, UsageError
+from hjepa_cli.errors import (
+    DataError,
+    HjepaError,
+    Interrupted,
+    OutOfMemory,
+    StorageError,
+    UsageError,
+    shell,
+)
 from hjepa_cli.output.screen import Screen, one_line
 from hjepa_cli.output.streams import Lasting, PipeClosed, lasting_streams
 from hjepa_cli.plugins import blamed, in_force, load_file
@@ -32,12 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     with contextlib.ExitStack() as streams:
         out, errors = streams.enter_context(lasting_streams()), sys.stderr
-        if torchrun.follows():
-            nowhere = streams.enter_context(open(os.devnull, "w"))
-            for redirect in (contextlib.redirect_stdout, contextlib.redirect_stderr):
-                streams.enter_context(redirect(nowhere))
-        code = _run_command(argv, errors)
-        code = _delivered(out, code)
+        code = _delivered(out, _run_command(argv, errors, streams))
     sys.exit(code)
 
 
@@ -53,9 +55,14 @@ def _delivered(out: Lasting | None, code: int) -> int:
     return StorageError.exit_code
 
 
-def _run_command(argv: list[str], errors: TextIO) -> int:
+def _run_command(argv: list[str], errors: TextIO, streams: contextlib.ExitStack) -> int:
     """Run one command; return the exit code after reporting any error to ``errors``."""
+    follows = False
     try:
+        if follows := torchrun.follows():  # the process that leads says the same
+            nowhere = streams.enter_context(open(os.devnull, "w"))
+            for redirect in (contextlib.redirect_stdout, contextlib.redirect_stderr):
+                streams.enter_context(redirect(nowhere))
         for path in _plugins(argv):  # one may add a command
             load_file(path)
         returned = get_command(build()).main(argv, prog_name="hjepa", standalone_mode=False)
@@ -68,8 +75,8 @@ def _run_command(argv: list[str], errors: TextIO) -> int:
         failure = _expected(error, argv)
     if isinstance(failure, PipeClosed):
         return failure.exit_code
-    if torchrun.follows() and not isinstance(failure, torchrun.OneOfSeveral):
-        return failure.exit_code  # the process that leads says the same
+    if follows and not isinstance(failure, torchrun.OneOfSeveral):
+        return failure.exit_code
     screen = Screen(json="--json" in argv, stderr=errors)
     screen.error(failure.message, failure.hint)
     if screen.json:
@@ -102,7 +109,7 @@ def _usage(argv: list[str]) -> str:
         return f"commands: {', '.join(getattr(group, 'commands', {}))}"
     for source in in_force():  # one may have made the command
         words += [] if source.installed else ["--plugin", source.name]
-    return f"hjepa {shlex.join(words)} --help"
+    return f"hjepa {shell(words)} --help"
 
 
 def _expected(error: BaseException, argv: list[str]) -> HjepaError:
@@ -116,6 +123,11 @@ def _expected(error: BaseException, argv: list[str]) -> HjepaError:
         return Interrupted("interrupted", hint="run the same command again", code=exit_code(error))
     if hasattr(error, "format_message"):  # Typer's usage errors; it has no public base class
         return UsageError(" ".join(error.format_message().split()), hint=_usage(argv))
+    if isinstance(error, UnicodeEncodeError):
+        return UsageError(
+            f"'{error.object}' has characters that this locale has no bytes for",
+            hint="run it again with LC_ALL=C.UTF-8",
+        )
     plugin = f"plugin {place}: " if (place := blamed(error)) else ""
     if isinstance(error, OSError):
         where = f": {error.filename}" if error.filename else ""
@@ -123,6 +135,8 @@ def _expected(error: BaseException, argv: list[str]) -> HjepaError:
             f"{plugin}{error.strerror or error}{where}",
             hint="check the path, its permissions and the disk",
         )
+    if memory.ran_out(error):
+        return OutOfMemory(f"{plugin}not enough memory: {error}".rstrip(": "), hint=memory.SMALLER)
     first_line = next(iter(str(error).splitlines()), "")
     if plugin:
         return UsageError(

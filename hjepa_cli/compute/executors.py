@@ -158,7 +158,8 @@ def worker_pool(
     others = set(multiprocessing.active_children())  # of the program that calls us
     begin = plugins.in_force(), initializer, *arguments
     with spawning():
-        pool = ProcessPoolExecutor(count, context, initializer=with_plugins, initargs=begin)
+        with semaphores():
+            pool = ProcessPoolExecutor(count, context, initializer=with_plugins, initargs=begin)
         try:
             yield pool
         except BaseException:
@@ -167,6 +168,22 @@ def worker_pool(
             raise
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def semaphores() -> Iterator[None]:
+    """Say what to do where the system has no POSIX semaphores, which processes need to share.
+
+    Raises:
+        NumericalError: it has none, or no place for them.
+    """
+    try:
+        yield
+    except (OSError, ImportError, NotImplementedError) as error:
+        raise NumericalError(
+            f"no worker processes: this system gives no semaphores ({error})",
+            hint="run it with --workers 0; results are the same",
+        ) from None
 
 
 def with_plugins(
@@ -204,7 +221,7 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with spawning():
         if where == LOCAL:
-            with signals_blocked():
+            with signals_blocked(), semaphores():
                 local = dask.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,

@@ -19,9 +19,13 @@ LARGEST = sys.float_info.max  # bounds what is not bounded otherwise: no infinit
 LARGEST_SEED = 2**63 - 1
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 
-Count = Annotated[int, Meta(ge=1)]
-CountFromTwo = Annotated[int, Meta(ge=2)]  # nothing is learned without a next one
-CountOrNone = Annotated[int, Meta(ge=0)]
+MOST = 10**9  # of anything: beyond what any machine holds or any program counts
+WIDEST = 2**16  # values of an embedding or a layer
+
+Count = Annotated[int, Meta(ge=1, le=MOST)]
+CountFromTwo = Annotated[int, Meta(ge=2, le=MOST)]  # nothing is learned without a next one
+CountOrNone = Annotated[int, Meta(ge=0, le=MOST)]
+Width = Annotated[int, Meta(ge=1, le=WIDEST)]
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
@@ -91,8 +95,8 @@ class EncoderSettings:
         Count,
         Flag("--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
     ] = 2
-    embedding: Count = 256
-    hidden: Count = 1024
+    embedding: Width = 256
+    hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
     frame_input: Literal["difference", "pair"] = "difference"
     stride_actions: Literal["all", "held"] = "all"
@@ -144,7 +148,7 @@ class EncoderSettings:
 class ActorSettings:
     """Both training stages fit the semantic actor."""
 
-    hidden: Count = 1024
+    hidden: Width = 1024
     dropout: BelowOne = 0.2
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     learning_rate: NotNegative = 1e-3

@@ -7,7 +7,6 @@ within a training. Runs that do not belong into one picture are refused.
 
 import dataclasses
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.statistics import student_interval
-from hjepa_cli.errors import DataError, MissingInputError, require
+from hjepa_cli.errors import DataError, MissingInputError, require, shell
 from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.report import NO_RESULT, SMOKE, found_runs, inputs_of, stage_of
@@ -160,7 +159,7 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
         again += [*inputs_of(environment), "--out", f"{directory}-again", "--remeasure"]
         raise DataError(
             f"{directory / runs.RESULT}: {reason}",
-            hint=f"leave it out, or in its place: {shlex.join(again)}",
+            hint=f"leave it out, or in its place: {shell(again)}",
         )
     all_of = result["methods"]
     entries = {name: all_of[name] for name in all_of if methods is None or name in methods}

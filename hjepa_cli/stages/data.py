@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hjepa_cli.compute import memory
 from hjepa_cli.core.datasets import exports
 from hjepa_cli.core.datasets.dataset import (
     MANIFEST,
@@ -124,6 +125,7 @@ def export(
     """
     kind = chosen_format(out, kind)
     data = open_dataset(path, screen)
+    memory.check(held_bytes(data, split), f"split '{split}' of {data.path}")
     recorded = data.split(split)
     target = files.target(out or Path(f"{data.path.name}-{split}{FORMATS[kind][0]}"))
     system = plant(data.plant)
@@ -148,7 +150,7 @@ def export(
         if kind == "hdf5":
             exports.write_hdf5(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
         else:
-            exports.write_npz(target, values, filmed, about)
+            exports.write_npz(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
     names = sorted([*values, *(["pixels"] if pixels else [])])
     screen.say(f"{len(recorded)} trajectories, {', '.join(names)}: {target}")
     return {
@@ -236,6 +238,15 @@ def chosen_format(out: Path | None, kind: str | None) -> str:
     return kind or str(meant)
 
 
+def held_bytes(data: Dataset, split: str) -> int:
+    """Return what an export holds at once: the split twice while it is read, then its columns."""
+    described = data.splits.get(split, {"trajectories": 0, "steps": 0})
+    system = plant(data.plant)
+    row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
+    stored_bytes = HEIGHT_PX * WIDTH_PX * 3 * (data.frames == "stored")
+    return described["trajectories"] * (described["steps"] + 1) * (4 * row_bytes + 2 * stored_bytes)
+
+
 def plan_export(
     path: Path | None, out: Path | None, split: str, kind: str | None, pixels: bool
 ) -> Plan:
@@ -258,4 +269,5 @@ def plan_export(
         writes=[f"{kind} file {target}"],
         writes_bytes=rows * row_bytes + frames * COMPRESSED_FRAME_BYTES,
         seconds=1 + seconds_of({"rendered frames": frames, "exported frames": frames}),
+        memory_bytes=held_bytes(data, split),
     )

@@ -9,7 +9,7 @@ from typing import Any
 from hjepa_cli.config.checks import needs_model, split_late
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.control.loop import LOOP_VERSION
+from hjepa_cli.core.control.loop import LOOP_VERSION, check_memory
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.bench import Bench
@@ -34,6 +34,7 @@ def plan_curves(
 ) -> tuple[list[str], float]:
     """Return what :func:`curves_for` would do, by lines, and about how many seconds it takes."""
     protocol = models.settings.protocol
+    check_memory(protocol, max(protocol.curve_devices, protocol.bracket_devices))
     found = {} if remeasure else cached(models, methods)
     known, missing = ([name for name in methods if (name in found) is had] for had in (True, False))
     work = [f"take the cached curves of {', '.join(known)}"] if known else []
@@ -86,7 +87,8 @@ def curves_for(
     Returns:
         The document of ``eval --json``. Methods without a model are left out, and said.
     """
-    settings = models.settings
+    settings, protocol = models.settings, models.settings.protocol
+    check_memory(protocol, max(protocol.curve_devices, protocol.bracket_devices))
     models.say_skipped(settings.methods, screen)
     methods = models.measurable(settings.methods) if methods is None else methods
     shares = [
@@ -114,9 +116,9 @@ def curves_for(
         "plant": settings.plant,
         "seed": settings.seed,
         "loop_version": LOOP_VERSION,
-        "acceptable_score": settings.protocol.acceptable_score,
-        "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
-        "horizon": list(range(settings.protocol.horizon + 1)),
+        "acceptable_score": protocol.acceptable_score,
+        "acceptable_lq_ratio": protocol.acceptable_lq_ratio,
+        "horizon": list(range(protocol.horizon + 1)),
         "methods": {name: found[name][0] for name in methods},
         "skipped": models.skipped(settings.methods),
         "curves": record.path(CURVES_FILE),

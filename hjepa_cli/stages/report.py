@@ -7,7 +7,6 @@ the commands that make it again. Figures can also be written as files for a pape
 import base64
 import csv
 import io
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefi
 
 from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, shell
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
 from hjepa_cli.storage import files, runs
 
@@ -84,7 +83,7 @@ def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") 
         if not below:
             if (path / runs.CONFIG).is_file():
                 raise MissingInputError(
-                    f"{path} is an unfinished run", hint=f"hjepa resume {shlex.quote(str(path))}"
+                    f"{path} is an unfinished run", hint=shell(["hjepa", "resume", path])
                 )
             raise MissingInputError(f"no finished run in {path}", hint=made_by)
         found += below
@@ -136,8 +135,8 @@ def describe(directory: Path) -> dict[str, Any]:
         "made_by": runs.version_of(environment),
         "result": runs.read_result(directory),
         "config": runs.read_config(directory),
-        "command": shlex.join(["hjepa", *map(str, environment.get("command", [])[1:])]),
-        "again": shlex.join(["hjepa", stage, "--config", str(config), *inputs_of(environment)]),
+        "command": shell(["hjepa", *map(str, environment.get("command", [])[1:])]),
+        "again": shell(["hjepa", stage, "--config", str(config), *inputs_of(environment)]),
         "environment": versions | {key: environment.get(key) for key in MACHINE},
         "toml": files.read_bytes(config, limit=files.JSON_LIMIT_BYTES).decode(),
     }
@@ -148,7 +147,7 @@ def damaged(directory: Path, error: Exception) -> DataError:
     stage, missing = stage_of(directory), str(error).rpartition("has no attribute ")[2]
     return DataError(
         f"{directory / runs.RESULT} lacks what a {stage} run has: {missing}",
-        hint=f"hjepa {stage} --config {directory / runs.CONFIG}",
+        hint=shell(["hjepa", stage, "--config", directory / runs.CONFIG]),
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from hjepa_cli.config.checks import check_schedulable, check_warmup
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.loop import check_memory
 from hjepa_cli.core.evaluation.device_ratios import best_flat, ratio_of
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES
 from hjepa_cli.core.evaluation.workers import open_workers
@@ -54,6 +55,7 @@ class BySimulation:
         linked = [name for name in settings.methods if METHODS[name].needs_link]
         check_schedulable(linked, settings.protocol.total_steps)
         check_warmup(settings.protocol)
+        check_memory(settings.protocol, BLOCK_DEVICES)
         self._settings, self._screen = settings, screen
         self.models = open_model_set(settings, screen, checkpoint, None, further)
         self.methods = self.models.measurable(linked)

@@ -24,7 +24,7 @@ from hjepa_cli.core.training.optimiser import fit_actor
 from hjepa_cli.core.training.ranks import joined
 from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
 from hjepa_cli.core.training.shared_norm import share_statistics
-from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.errors import NumericalError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_gates
 from hjepa_cli.stages import baselines
@@ -142,7 +142,7 @@ def train_and_gate(run: TrainingRun) -> dict[str, Any]:
         raise NumericalError(
             f"the encoder failed its gate: {', '.join(failed)}",
             hint="collect more trajectories or train for more steps; --no-gate skips the gate, and "
-            f"hjepa {following} {flag} {path} goes on with this one",
+            f"{shell(['hjepa', following, flag, path])} goes on with this one",
         )
     result = run.finish(health=report, gates=gates)
     screen.say(f"{path} in {result['seconds']:.0f} s; next: hjepa {following}")

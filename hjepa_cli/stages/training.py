@@ -16,12 +16,14 @@ import torch
 from numpy.random import Generator
 from torch import Tensor, nn
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.device import autocast, keep_freed_memory, resolve_device
 from hjepa_cli.compute.torchrun import ContactLost
 from hjepa_cli.compute.versions import versions
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.datasets.dataset import Dataset, Trajectories
 from hjepa_cli.core.networks.model import build_modules
+from hjepa_cli.core.plants.frames import FRAME_BITS
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.progress import Part, Progress
@@ -29,7 +31,7 @@ from hjepa_cli.core.training.ranks import ALONE, Ranks
 from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.inputs import open_dataset, render
+from hjepa_cli.stages.inputs import count_frames, open_dataset, render
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint
 from hjepa_cli.storage.files import canonical_json
@@ -125,6 +127,8 @@ def open_training_data(path: Path | None, settings: Settings, *, h: int = 0) -> 
     """
     resolve_device(settings.device)  # refused before anything is read
     dataset = open_dataset(path, settings)
+    frames = count_frames(dataset, settings, *SPLITS)
+    memory.check(rendered_bytes(frames), f"training on {frames} frames")
     recorded = {split: dataset.split(split) for split in SPLITS}
     check_stride(h, recorded["train"].steps)
     return dataset, recorded
@@ -202,7 +206,13 @@ def plan_training(
         writes=[f"run {run_directory(stage, out)}"],
         writes_bytes=sum(tensor.nbytes for tensor in tensors),
         seconds=5 + seconds_of(amounts),
+        memory_bytes=rendered_bytes(amounts.get("rendered frames", 0)),
     )
+
+
+def rendered_bytes(frames: float) -> float:
+    """Return what a training's frames take while they are rendered: as parts, and as a whole."""
+    return 2 * frames * FRAME_BITS / 8
 
 
 def check_stride(h: int, steps: int) -> None:

@@ -13,7 +13,6 @@ import io
 import json
 import os
 import platform
-import shlex
 import sys
 import time
 import tomllib
@@ -26,7 +25,7 @@ from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.compute.versions import TRAINED_WITH, versions
 from hjepa_cli.config.schema import Settings, dotted
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
+from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError, shell
 from hjepa_cli.plugins import Source, in_force
 from hjepa_cli.storage import files, seals, tracking
 
@@ -230,9 +229,7 @@ class Run:
         self.event("started")
 
     def _append(self, name: str, text: str) -> None:
-        path = self.path(name)
-        with files.writing(path), open(path, "a", encoding="utf-8", newline="") as file:
-            file.write(text)
+        files.append(self.path(name), files.encoded(text))
 
 
 def newest_run(
@@ -357,7 +354,7 @@ def check_plugins(directory: Path, recorded: Mapping[str, Any]) -> None:
 def continue_command(directory: Path, plugins: Iterable[Source] | None = None) -> str:
     """Return what takes a run up again, with its plugins, or those that are in force now."""
     words = ["resume", str(directory), *_named(in_force() if plugins is None else plugins)]
-    return f"{torchrun.program()} {shlex.join(words)}"
+    return f"{torchrun.program()} {shell(words)}"
 
 
 def anew(recorded: Mapping[str, Any], config: Path | None = None) -> str:
@@ -370,7 +367,7 @@ def anew(recorded: Mapping[str, Any], config: Path | None = None) -> str:
             words.append(flag)
         elif isinstance(value, Mapping) and " " not in name:  # of several models the first
             words += [flag, str(value.get("path"))]
-    return f"hjepa {shlex.join(words)}"
+    return f"hjepa {shell(words)}"
 
 
 def _named(plugins: Iterable[Source]) -> list[str]:

@@ -96,7 +96,10 @@ def test_a_pipe_without_a_reader_ends_quietly(tmp_path: Path, command: str) -> N
     os.close(read_end)
     done = subprocess.run(
         [sys.executable, "-m", "hjepa_cli", *command.split()],
-        **{"cwd": tmp_path, "env": ENVIRONMENT, "stdout": write_end, "stderr": subprocess.PIPE},
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        stdout=write_end,
+        stderr=subprocess.PIPE,
         check=False,
     )
     os.close(write_end)

@@ -113,6 +113,24 @@
 | 33 | streams that are None | test_streams.py::test_streams_that_are_none_are_the_null_device |
 | 33 | a file in the place of a stream | test_streams.py::test_no_file_of_ours_is_what_a_closed_stream_was |
 | 33 | a full log disk during a run | test_streams.py::test_a_run_survives_a_full_log_disk |
+| 34 | a launcher's variable missing or wrong | test_launcher.py::test_a_variable_that_is_wrong_is_named |
+| 34 | a process that never comes | test_launcher.py::test_a_peer_that_never_comes_is_waited_for_aloud_and_interruptibly |
+| 34 | a launcher's port taken | test_launcher.py::test_a_port_that_is_taken_is_named |
+| 35 | a directory moved under a run | test_odd_disks.py::test_a_run_whose_directory_was_moved_writes_into_no_other |
+| 35 | the same, deleted | test_odd_disks.py::test_a_deleted_directory_is_not_made_again |
+| 35 | two collections in one place | test_odd_disks.py::test_two_collections_one_in_the_place_of_the_other_do_not_mix |
+| 35 | a worker's directory moved | test_odd_disks.py::test_a_worker_writes_into_the_directory_that_was_locked |
+| 36 | memory runs out | test_memory.py::test_running_out_of_memory_is_no_error_to_report |
+| 36 | sizes beyond the memory | test_memory.py::test_sizes_beyond_the_memory_are_refused_before_any_work |
+| 36 | sizes beyond all machines | test_memory.py::test_sizes_have_upper_bounds |
+| 36 | a dataset beyond the memory | test_memory.py::test_a_training_beyond_the_memory_is_refused |
+| 36 | a split beyond the memory | test_memory.py::test_an_export_beyond_the_memory_is_refused |
+| 36 | an export that is held whole | test_memory.py::test_an_export_takes_no_more_memory_for_more_trajectories |
+| 37 | a disk without locks | test_odd_disks.py::test_a_disk_without_locks_is_said_and_used |
+| 37 | a disk that flushes no directories | test_odd_disks.py::test_a_disk_that_cannot_flush_directories_is_used |
+| 37 | a system without semaphores | test_odd_disks.py::test_without_semaphores_there_is_one_process |
+| 38 | paths that are no UTF-8 | test_paths.py::test_any_bytes_are_a_path_wherever_one_is_written |
+| 38 | a locale of few characters | test_paths.py::test_a_locale_of_few_characters_is_enough |
 """
 
 import ast
@@ -122,7 +140,7 @@ from pathlib import Path
 import pytest
 
 ROWS = re.findall(r"^\| (\d+) \| (.+?) \| (test_\w+\.py)::(test_\w+) \|$", __doc__, flags=re.M)
-FAULTS = 33  # kinds: 24 that have happened to others, then those found by trying
+FAULTS = 38  # kinds: 24 that have happened to others, then those found by trying
 
 
 @pytest.mark.parametrize(("kind", "fault", "file", "test"), ROWS)

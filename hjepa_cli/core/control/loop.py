@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats
@@ -54,6 +55,12 @@ Those before a device was switched on are copies of its first; see
 """
 
 
+def check_memory(protocol: ProtocolSettings, devices: int) -> None:
+    """Raise OutOfMemory where the draws of a closed loop do not fit."""
+    values = protocol.total_steps * devices * (len(protocol.half_widths) + 1)
+    memory.check(16 * values, f"a loop of {devices} devices over {protocol.total_steps} steps")
+
+
 @dataclasses.dataclass(frozen=True)
 class Draws:
     """Holds all random numbers of the closed loop, common to all methods and curve points.
@@ -78,6 +85,7 @@ class Draws:
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
         """Draw for ``devices`` devices, all derived from ``seed``."""
+        check_memory(protocol, devices)
         states = len(protocol.half_widths)
         initial = np.empty((devices, states))
         noise = np.empty((protocol.total_steps, devices, states))

@@ -22,7 +22,7 @@ from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import same_camera
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
 
@@ -280,7 +280,7 @@ class Model:
         if isinstance(architecture, dict) and architecture.get("kind") == "encoder":
             raise DataError(
                 f"{path} is a checkpoint of train-encoder, not of train-hierarchy",
-                hint=f"hjepa train-hierarchy --encoder {path}",
+                hint=shell(["hjepa", "train-hierarchy", "--encoder", path]),
             )
         return cls(load_modules(checkpoint), checkpoint.metadata, checkpoint.digest, device)
 
