@@ -178,7 +178,8 @@ def telling_how_to_go_on(directory: Path) -> Iterator[None]:
             code=exit_code(error),
         ) from None
     except HjepaError as error:
-        point_to(continue_command(directory), error)
+        if (directory / LOG).exists():  # else nothing is there yet that could be resumed
+            point_to(continue_command(directory), error)
         raise
 
 

@@ -24,6 +24,7 @@ from hjepa_cli.errors import DataError, MissingInputError, require, shell
 from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.report import NO_RESULT, SMOKE, found_runs, inputs_of, stage_of
+from hjepa_cli.stages.results import check_config
 from hjepa_cli.storage import runs
 
 AVERAGED = {  # of an entry of ``eval --json``, and where its interval goes
@@ -61,7 +62,9 @@ class Evaluation:
         sections = {name: self.config[name] for name in ("protocol", "conditions", "collect")}
         clean = (*curves.CLEAN, "start")
         sections["collect"] = {k: v for k, v in sections["collect"].items() if k in clean}
-        return {key: self.result[key] for key in ALIKE} | dotted(sections)
+        first = next(iter(self.result["methods"].values()), None)
+        grids = {} if first is None else _grids(first)
+        return {key: self.result[key] for key in ALIKE} | dotted(sections) | grids
 
     def draws(self) -> dict[str, Any]:
         """Return what must agree within a training besides: methods share their draws there."""
@@ -153,6 +156,7 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
     Raise DataError for no result of ``eval``, an older one, or models of several trainings.
     """
     result, config = runs.read_result(directory), runs.read_config(directory)
+    check_config("eval", config, directory)
     environment = runs.read_environment(directory)
     if reason := flaw(result, config):
         again = ["hjepa", "eval", "--config", str(directory / runs.CONFIG)]
@@ -167,7 +171,7 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
     return Evaluation(
         directory,
         result | {"methods": entries},
-        config | {"preset": environment["preset"]},
+        config | {"preset": environment.get("preset")},
         dataset["sha256"] if isinstance(dataset, dict) else None,
         training_seed(directory, result["training_seeds"], entries),
     )
@@ -180,7 +184,7 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
         msgspec.convert(config, _Config)
     except msgspec.ValidationError as error:
         return f"{error} (an older version?)"
-    steps = len(result["horizon"])
+    steps, first = len(result["horizon"]), next(iter(result["methods"].values()), None)
     for name, entry in result["methods"].items():
         if reason := curves.flaw(entry):
             return f"method '{name}': {reason}"
@@ -188,7 +192,18 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
             return f"method '{name}': no 'nmae_every_step' (an older version?)"
         if not steps == len(entry["nmae"]) == len(entry["nmae_ci95"]):
             return f"method '{name}': 'nmae' is not over the horizon"
+        if _grids(entry) != _grids(first):
+            return f"method '{name}' was not measured at the points of the others"
     return None
+
+
+def _grids(entry: Entry) -> dict[str, Any]:
+    """Return where a method was measured: windows of steps, gaps, delivery probabilities."""
+    return {
+        "windows": sorted(entry["nmae_windows"]),
+        "gaps": [point["d"] for point in entry["gap_curve"]],
+        "probabilities": [point["p"] for point in entry["delivery_curve"]],
+    }
 
 
 def training_seed(

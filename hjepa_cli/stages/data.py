@@ -18,7 +18,7 @@ from hjepa_cli.core.datasets.dataset import (
 )
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError, require
+from hjepa_cli.errors import HjepaError, MissingInputError, UsageError, require
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan, seconds_of, size
 from hjepa_cli.storage import files
@@ -27,6 +27,7 @@ Result = dict[str, Any]
 
 ROOT = Path("data")
 FORMATS = {"hdf5": (".h5", ".hdf5"), "npz": (".npz",)}  # the first suffix is written by default
+MOST_NAMED = 20  # damaged files in one message
 COMPRESSED_FRAME_BYTES = 700
 
 
@@ -54,7 +55,8 @@ def show_info(screen: Screen, path: Path | None) -> Result:
 def verify(screen: Screen, paths: Sequence[Path]) -> Result:
     """Read every shard and check sha256, shapes and values; all of data/ if none is named.
 
-    Raise MissingInputError without any, and DataError for the first damaged one, after all of them.
+    Raise MissingInputError without any, and, after all of them, the error of the first shard or
+    dataset that is damaged or unreadable, which names the others too.
     """
     wanted = list(paths) or [
         ROOT / name for name in files.list_names(ROOT) if (ROOT / name / MANIFEST).exists()
@@ -66,8 +68,12 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
     for path in wanted:
         try:
             data = load_dataset(path)
+            flaws = list(data.flaws())
+            damaged += flaws
+            if flaws:
+                continue
             ranges = {name: spread(data.split(name)) for name in data.splits}
-        except (DataError, MissingInputError) as error:
+        except HjepaError as error:
             damaged.append(error)
             continue
         verified.append({**summary(data), "states": ranges})
@@ -79,10 +85,13 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
                 for name, spans in ranges.items()
             ],
         )
-    for further in damaged[1:]:
-        screen.say(further.message)
     if damaged:
-        raise damaged[0]
+        first = damaged[0]
+        if len(damaged) > 1:
+            named = [one.message for one in damaged[:MOST_NAMED]]
+            named += [f"{len(damaged) - MOST_NAMED} more"] * (len(damaged) > MOST_NAMED)
+            first.message = f"{len(damaged)} files are damaged or unreadable: {'; '.join(named)}"
+        raise first
     return {"verified": verified}
 
 
@@ -253,6 +262,8 @@ def plan_export(
     """Plan ``hjepa data export``; arguments as of :func:`export`."""
     kind = chosen_format(out, kind)
     data = load_dataset(path or newest())
+    if split not in data.splits:
+        data.split(split)  # says so
     described = data.splits[split]
     rows = described["trajectories"] * (described["steps"] + 1)
     system = plant(data.plant)

@@ -15,8 +15,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefi
 
 from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, MissingInputError, shell
+from hjepa_cli.errors import MissingInputError, shell
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
+from hjepa_cli.stages import results
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
@@ -57,8 +58,9 @@ def run(
             drawn = draw(one, directory, screen)
             one["figures"] = [(text, _svg(figure)) for text, figure in drawn.values()]
             sections.append(section(one))
-        except (UndefinedError, KeyError, TypeError, IndexError, AttributeError) as error:
-            raise damaged(directory, error) from None
+        except (UndefinedError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+            missing = str(error).rpartition("has no attribute ")[2]
+            raise results.damaged(directory, one["stage"], missing) from None
         described.append(one)
         if figures is not None:
             written += write_figures(drawn, figures, one["stage"], formats)
@@ -126,29 +128,23 @@ def page_template() -> Template:
 def describe(directory: Path) -> dict[str, Any]:
     """Return what the page says of a run. Raises DataError or MissingInputError."""
     environment, stage = runs.read_environment(directory), stage_of(directory)
+    result, settings = runs.read_result(directory), runs.read_config(directory)
+    results.check(stage, result, directory)
+    results.check_config(stage, settings, directory)
     config = directory / runs.CONFIG
     versions = {f"version of {name}": v for name, v in environment.get("versions", {}).items()}
     return {
         "stage": stage,
         "directory": directory,
-        "preset": environment["preset"],
+        "preset": environment.get("preset"),
         "made_by": runs.version_of(environment),
-        "result": runs.read_result(directory),
-        "config": runs.read_config(directory),
+        "result": result,
+        "config": settings,
         "command": shell(["hjepa", *map(str, environment.get("command", [])[1:])]),
         "again": shell(["hjepa", stage, "--config", str(config), *inputs_of(environment)]),
         "environment": versions | {key: environment.get(key) for key in MACHINE},
         "toml": files.read_bytes(config, limit=files.JSON_LIMIT_BYTES).decode(),
     }
-
-
-def damaged(directory: Path, error: Exception) -> DataError:
-    """Return the error of a result that lacks what its stage writes."""
-    stage, missing = stage_of(directory), str(error).rpartition("has no attribute ")[2]
-    return DataError(
-        f"{directory / runs.RESULT} lacks what a {stage} run has: {missing}",
-        hint=shell(["hjepa", stage, "--config", directory / runs.CONFIG]),
-    )
 
 
 def inputs_of(environment: Mapping[str, Any]) -> list[str]:

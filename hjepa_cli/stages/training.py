@@ -31,6 +31,7 @@ from hjepa_cli.core.training.ranks import ALONE, Ranks
 from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages import results
 from hjepa_cli.stages.inputs import count_frames, open_dataset, render
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint
@@ -176,7 +177,8 @@ def run_training(
                 hint="keep --dataset and --out on a disk that all machines share",
             )
         if record.result is not None:
-            show(record.result, screen)
+            with results.showing(stage, record.result, record.directory):
+                show(record.result, screen)
             return record.result
         run = TrainingRun(stage, settings, dataset, recorded, record, progress, screen, ranks)
         try:

@@ -20,6 +20,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any, Self
 
+import msgspec
+
 from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.compute.versions import TRAINED_WITH, versions
@@ -280,9 +282,10 @@ def read_result(directory: Path) -> dict[str, Any]:
 
 
 def _tables(directory: Path) -> dict[str, str]:
-    """Return the sha256 of each table of a run by name."""
-    tables = (path for path in directory.glob("*.csv") if path.is_file())
-    return {path.name: hashlib.sha256(files.read_bytes(path)).hexdigest() for path in tables}
+    """Return the sha256 of each table of a run, and of its other records, by name."""
+    records = (directory / CONFIG, directory / ENVIRONMENT)
+    found = (path for path in (*directory.glob("*.csv"), *records) if path.is_file())
+    return {path.name: hashlib.sha256(files.read_bytes(path)).hexdigest() for path in found}
 
 
 def read_config(directory: Path) -> dict[str, Any]:
@@ -322,16 +325,39 @@ def read_environment(directory: Path) -> dict[str, Any]:
         files.check_schema(schema, SCHEMA, f"run {directory}")
     if schema == 1:
         recorded["inputs"] = {}
-    plugins = recorded.setdefault("plugins", [])
-    named = isinstance(plugins, list) and all(
-        isinstance(one, dict) and all(isinstance(one.get(key), str) for key in ("name", "sha256"))
-        for one in plugins
-    )
-    stage, inputs, settings = (recorded.get(key) for key in ("stage", "inputs", "settings"))
-    known = isinstance(settings, dict) or recorded["schema"] < SCHEMA
-    if not (named and known and isinstance(stage, str) and isinstance(inputs, dict)):
-        raise DataError(f"{path} lacks fields or has malformed ones")
+    recorded.setdefault("plugins", [])
+    try:
+        msgspec.convert(recorded, _Environment)
+    except msgspec.ValidationError as error:
+        raise DataError(f"{path} lacks fields or has malformed ones: {error}") from None
+    if schema == SCHEMA and "settings" not in recorded:
+        raise DataError(f"{path} lacks fields or has malformed ones: no `settings`")
     return recorded
+
+
+class _Named(msgspec.Struct):
+    name: str
+    sha256: str
+
+
+class _Input(msgspec.Struct):
+    path: str
+    sha256: str
+
+
+class _Environment(msgspec.Struct):
+    """It is all of ``environment.json`` that is relied on, or shown."""
+
+    stage: str
+    inputs: dict[str, _Input | bool | int | float | str | list[Any] | None]
+    plugins: list[_Named]
+    preset: str | None = None
+    settings: dict[str, Any] = {}
+    command: list[str] = []
+    versions: dict[str, str | None] = {}
+    system: str | None = None
+    machine: str | None = None
+    cpus: int | None = None
 
 
 def check_plugins(directory: Path, recorded: Mapping[str, Any]) -> None:

@@ -66,7 +66,9 @@ def test_a_locale_of_few_characters_is_enough(tmp_path: Path, words: list[str]) 
     small = ["--preset", "smoke", "--trajectories", "2"] if "collect" in words else []
     done = subprocess.run(
         [sys.executable, "-m", "hjepa_cli", *words, *small],
-        **{"cwd": tmp_path, "env": ENVIRONMENT | poor, "capture_output": True},
+        cwd=tmp_path,
+        env=ENVIRONMENT | poor,
+        capture_output=True,
         check=False,
     )
     assert done.returncode == (66 if "info" in words else 0), done

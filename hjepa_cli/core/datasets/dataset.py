@@ -123,6 +123,15 @@ class Dataset:
         joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         return Trajectories(**joined)
 
+    def flaws(self) -> Iterator[HjepaError]:
+        """Yield what is wrong with each shard that is gone, unreadable or not as it was written."""
+        for split in self.splits.values():
+            for shard in split["shards"]:
+                try:
+                    self._read_shard(shard, split["steps"])
+                except HjepaError as error:
+                    yield error
+
     def _read_shard(self, shard: Mapping[str, Any], steps: int) -> dict[str, np.ndarray]:
         path = self.path / shard["name"]
         stored = self.frames == "stored"
