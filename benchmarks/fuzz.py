@@ -311,25 +311,23 @@ class Shown(Target):
         self.expected = {run: self._printed(run) for run in self.runs}
 
     def damage(self, chance: random.Random) -> int:
-        for name, data in self.good[self.run].items():
-            (self.run / name).write_bytes(data)
+        for name, whole in self.good[self.run].items():
+            (self.run / name).write_bytes(whole)
         self.run, self.forged = chance.choice(self.runs), chance.random() < 0.5
         name = chance.choice(sorted(self.good[self.run]))
-        data = self.good[self.run][name]
+        found = self.good[self.run][name]
         if not self.forged:
-            return self._write(self.run / name, change_number(data, chance))
+            return self._write(self.run / name, change_number(found, chance))
         if name in (runs.CONFIG, runs.METRICS):
-            data = mutate_bytes(data, chance)
+            lie = mutate_bytes(found, chance)
         else:
-            document = mutate_json(json.loads(data), chance)
-            lie = "sha256" in document if isinstance(document, dict) else False
-            data = json.dumps(seals.sealed(document) if lie else document).encode()
-        size = self._write(self.run / name, data)
-        if name != runs.RESULT:  # which names the others
+            document = mutate_json(json.loads(found), chance)
+            has_seal = isinstance(document, dict) and "sha256" in document
+            lie = json.dumps(seals.sealed(document) if has_seal else document).encode()
+        size = self._write(self.run / name, lie)
+        if name not in (runs.RESULT, "curves.json"):  # which the result names
             result = json.loads(self.good[self.run][runs.RESULT])
-            result["files"] |= (
-                {name: hashlib.sha256(data).hexdigest()} if "json" not in name else {}
-            )
+            result["files"][name] = hashlib.sha256(lie).hexdigest()
             self._write(self.run / runs.RESULT, json.dumps(seals.sealed(result)).encode())
         return size
 

@@ -41,6 +41,10 @@ class UsageError(HjepaError):
             self.args, self.key = (self.message,), None
 
 
+class ArrayError(UsageError, ValueError):
+    """An array from outside has another shape, type or range than a function takes."""
+
+
 class DataError(HjepaError):
     """A file does not hold what it should (foreign, truncated, tampered, other plant)."""
 

@@ -8,10 +8,12 @@ may be computed twice after a failure.
 import dataclasses
 import functools
 import importlib.util
+import json
 import logging
 import multiprocessing
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -33,6 +35,7 @@ IN_FLIGHT = 4  # units submitted per worker: enough to keep it busy, few enough 
 LOCAL = "local"
 RETRIES = 3  # of a unit whose Dask worker died
 CONNECT_S = 10
+LONGEST_GREETING = 2**20  # bytes of the first message of a Dask scheduler
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -230,10 +233,12 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
                 )
             target: dict[str, Any] = {"address": local}
         else:
-            target = {"scheduler_file": where} if Path(where).is_file() else {"address": where}
+            target = {"address": scheduler_address(where)}
         try:
+            if where != LOCAL:
+                check_answer(target["address"])
             client = dask.Client(**target, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError, AssertionError) as error:
             raise UsageError(
                 f"--cluster {where}: no Dask scheduler answers ({error or 'timeout'})",
                 hint=f"hjepa ... --cluster {LOCAL}, or start one: dask scheduler",
@@ -257,6 +262,39 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
             if where == LOCAL:
                 with suppress(TimeoutError):  # the work is done; they end with us
                     target["address"].close()
+
+
+def scheduler_address(where: str) -> str:
+    """Return the address of a scheduler, from its JSON file where ``where`` is one.
+
+    Raises:
+        UsageError: the file is none that a scheduler writes.
+    """
+    if not Path(where).exists():
+        return where
+    try:
+        found = json.loads(plugins.read_regular(Path(where)))
+        address = found["address"]
+        if not isinstance(address, str):
+            raise TypeError("its address is no text")
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        raise UsageError(
+            f"--cluster {where}: not the file of a Dask scheduler: {error or type(error).__name__}",
+            hint=f"dask scheduler --scheduler-file {where} writes one",
+        ) from None
+    return address
+
+
+def check_answer(address: str) -> None:
+    """Raise OSError unless who listens there begins as Dask does: it waits for others for good."""
+    scheme, sign, place = address.rpartition("://")
+    host, _, port = place.rpartition(":")
+    if (sign and scheme != "tcp") or not port.isdecimal():
+        return  # Dask says what is wrong with it
+    with socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S) as there:
+        begun = there.recv(8, socket.MSG_WAITALL)
+    if len(begun) < 8 or int.from_bytes(begun, "little") > LONGEST_GREETING:
+        raise OSError("what listens there is something else")
 
 
 def check_cluster(client: Any, where: str) -> None:

@@ -245,7 +245,7 @@ def describe_architecture(
 @torch.inference_mode()
 def examine(
     modules: nn.ModuleDict, test: RenderedSplit, h: int, settings: Settings
-) -> dict[str, float]:
+) -> dict[str, float | None]:
     """Return the held-out health of what this stage trained: the actor and the coarsest level."""
     z = embed(modules["encoder"], test, settings)
     names = ("actor", "high" if "high" in modules else "flat")

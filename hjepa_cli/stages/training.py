@@ -61,9 +61,13 @@ class TrainingRun:
 
     def render(self) -> list[RenderedSplit]:
         """Return the frames of both splits, for training and held out."""
-        return [
+        splits = [
             render(of, self.settings, self.screen, split) for split, of in self.recorded.items()
         ]
+        for name, split in zip(self.recorded, splits, strict=True):
+            if (split.frames == split.frames[0, 0]).all():
+                raise _still(self.dataset, name, "frames")
+        return splits
 
     def metadata(self, architecture: Architecture, **further: Any) -> dict[str, Any]:
         """Return what a checkpoint of this run says of itself, ``further`` included."""
@@ -132,7 +136,18 @@ def open_training_data(path: Path | None, settings: Settings, *, h: int = 0) -> 
     memory.check(rendered_bytes(frames), f"training on {frames} frames")
     recorded = {split: dataset.split(split) for split in SPLITS}
     check_stride(h, recorded["train"].steps)
+    for name, split in recorded.items():
+        if (split.states == split.states[0, 0]).all():
+            raise _still(dataset, name, "states")
     return dataset, recorded
+
+
+def _still(dataset: Dataset, split: str, what: str) -> DataError:
+    """Return the error of data without variance, of which nothing can be learned."""
+    return DataError(
+        f"dataset {dataset.path}: all {what} of split '{split}' are equal: nothing moves in it",
+        hint="hjepa collect with other starts or exploration in [collect] of --config FILE.toml",
+    )
 
 
 def run_training(

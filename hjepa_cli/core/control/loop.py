@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
@@ -151,7 +152,7 @@ def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
     Raises:
         UsageError: a gap D, whole or fractional, that is below 1 or infinite.
     """
-    if not 1 <= gap_steps < math.inf:
+    if not isinstance(gap_steps, Real) or not 1 <= gap_steps < math.inf:
         raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer, and finite")
     phases = gap_steps * np.fmod(np.arange(devices) * GOLDEN, 1.0)
     periods = np.arange(int(steps / gap_steps) + 1)
@@ -182,7 +183,7 @@ def delivery_schedule(probability: float, delivery: Floats) -> Bools:
     Raises:
         UsageError: p outside 0 … 1.
     """
-    if not 0 <= probability <= 1:
+    if not isinstance(probability, Real) or not 0 <= probability <= 1:
         raise UsageError(f"delivery probability {probability}; it lies between 0 and 1")
     schedule = delivery < probability
     schedule[0] = True
