@@ -1,4 +1,4 @@
-"""What models are given from outside is checked: other types or layouts would be read as garbage."""
+"""What models are given from outside is checked: other types or layouts are read as garbage."""
 
 from typing import Any
 
