@@ -23,7 +23,7 @@ from hjepa_cli.core.statistics import student_interval
 from hjepa_cli.errors import DataError, MissingInputError, require, shell
 from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.plugins import METHODS
-from hjepa_cli.stages.report import NO_RESULT, SMOKE, found_runs, inputs_of, stage_of
+from hjepa_cli.stages.report import NO_RESULT, found_runs, inputs_of, stage_of
 from hjepa_cli.stages.results import check_config
 from hjepa_cli.storage import runs
 
@@ -117,7 +117,7 @@ def run(
     if figures is not None:
         require("matplotlib", "a figure needs matplotlib", "plot")
     found = [open_evaluation(directory, methods) for directory in evaluations(paths)]
-    if any(one.config["preset"] == SMOKE for one in found):
+    if any(one.config["preset"] == runs.SMOKE for one in found):
         screen.say(NO_RESULT)
     check_alike(found)
     by_method, seeds = collected(found, methods)

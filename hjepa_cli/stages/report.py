@@ -26,7 +26,6 @@ Figures = dict[str, tuple[str, Any]]
 
 STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale")
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
-SMOKE = "smoke"
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
 
 
@@ -64,7 +63,7 @@ def run(
         described.append(one)
         if figures is not None:
             written += write_figures(drawn, figures, one["stage"], formats)
-    note = NO_RESULT if any(one["preset"] == SMOKE for one in described) else ""
+    note = NO_RESULT if any(one["preset"] == runs.SMOKE for one in described) else ""
     text = template.render(runs=described, sections=sections, note=note)
     files.write_text(files.target(out), text)
     if figures is not None:

@@ -182,7 +182,8 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
             alike = all(encoder[key] == wanted[key] for key in train_encoder.ARCHITECTURE)
             return is_jepa and alike and config["plant"] == settings.plant
 
-        name = newest_run("train-encoder", fits) or find_model(settings.plant)
+        newest = newest_run("train-encoder", fits, preset=settings.preset)
+        name = newest or find_model(settings.plant)
         if name is None:
             raise MissingInputError(
                 f"no finished train-encoder run of plant {settings.plant} and these settings "

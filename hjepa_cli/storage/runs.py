@@ -27,7 +27,14 @@ from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.compute.versions import TRAINED_WITH, versions
 from hjepa_cli.config.schema import Settings, dotted
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError, shell
+from hjepa_cli.errors import (
+    DataError,
+    HjepaError,
+    Interrupted,
+    MissingInputError,
+    UsageError,
+    shell,
+)
 from hjepa_cli.plugins import Source, in_force
 from hjepa_cli.storage import files, seals, tracking
 
@@ -37,6 +44,8 @@ ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
 EVENTS = "events.jsonl"
 RESULT = "result.json"
+SMOKE = "smoke"  # the preset that shows that all of it runs, too small to learn
+LAST_EVENTS_BYTES = 4096
 ASKED = ("remeasure", "verify")  # flags that are work, which a finished run has done or has not
 
 SCHEMA = 3  # of environment.json; 1 had neither a schema nor inputs, 2 no settings
@@ -235,22 +244,52 @@ class Run:
 
 
 def newest_run(
-    stage: str, predicate: Callable[[Path], bool] = lambda directory: True
+    stage: str,
+    predicate: Callable[[Path], bool] = lambda directory: True,
+    *,
+    preset: str | None = SMOKE,
 ) -> Path | None:
-    """Return the newest finished ``runs/<stage>/*`` that is not damaged and fits."""
-    for directory in finished_runs(stage):
+    """Return the newest finished ``runs/<stage>/*`` that is not damaged and fits.
+
+    Those of preset smoke have learned nothing: only who works with that ``preset`` gets them.
+    """
+    for directory in finished_runs(stage, preset=preset):
         with contextlib.suppress(DataError, MissingInputError, LookupError, TypeError):
             if predicate(directory):
                 return directory
     return None
 
 
-def finished_runs(*stages: str) -> list[Path]:
-    """Return the finished ``runs/<stage>/*`` of some stages, newest first."""
+def finished_runs(*stages: str, preset: str | None = SMOKE) -> list[Path]:
+    """Return the finished ``runs/<stage>/*`` of some stages, newest first.
+
+    Those of preset smoke are left out, unless ``preset`` is that.
+    """
     places = (ROOT / stage for stage in stages)
     every = (place / name for place in places for name in files.list_names(place))
-    finished = (directory for directory in every if (directory / RESULT).is_file())
-    return sorted(finished, key=lambda one: ((one / RESULT).stat().st_mtime_ns, one), reverse=True)
+    finished = [directory for directory in every if (directory / RESULT).is_file()]
+    if preset != SMOKE:
+        finished = [directory for directory in finished if not is_smoke(directory)]
+    return sorted(finished, key=lambda one: (_ended_s(one), one), reverse=True)
+
+
+def is_smoke(directory: Path) -> bool:
+    """Return whether a run was of preset smoke; a damaged record does not say so."""
+    with contextlib.suppress(HjepaError):
+        return read_environment(directory).get("preset") == SMOKE
+    return False
+
+
+def _ended_s(directory: Path) -> float:
+    """Return when a run wrote of itself last: copying and checking out change the times of files."""
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        with open(directory / EVENTS, "rb") as file:
+            file.seek(max(os.path.getsize(directory / EVENTS) - LAST_EVENTS_BYTES, 0))
+            *_, last = file.read().splitlines()
+        time_s = json.loads(last)["time"]
+        if isinstance(time_s, float | int) and 0 < time_s < time.time() + 86_400:
+            return float(time_s)
+    return (directory / RESULT).stat().st_mtime
 
 
 def read_result(directory: Path) -> dict[str, Any]:
