@@ -16,7 +16,7 @@ from typer.main import get_command
 
 from hjepa_cli.cli.builder import build
 from hjepa_cli.compute import memory, torchrun
-from hjepa_cli.compute.interrupts import exit_code
+from hjepa_cli.compute.interrupts import end_at_once, exit_code
 from hjepa_cli.errors import (
     DataError,
     HjepaError,
@@ -39,7 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     with contextlib.ExitStack() as streams:
         out, errors = streams.enter_context(lasting_streams()), sys.stderr
-        code = _delivered(out, _run_command(argv, errors, streams))
+        code = _run_command(argv, errors, streams, ends=arguments is None)
+        code = _delivered(out, code)
     sys.exit(code)
 
 
@@ -55,8 +56,13 @@ def _delivered(out: Lasting | None, code: int) -> int:
     return StorageError.exit_code
 
 
-def _run_command(argv: list[str], errors: TextIO, streams: contextlib.ExitStack) -> int:
-    """Run one command; return the exit code after reporting any error to ``errors``."""
+def _run_command(
+    argv: list[str], errors: TextIO, streams: contextlib.ExitStack, *, ends: bool
+) -> int:
+    """Run one command; return the exit code after reporting any error to ``errors``.
+
+    Where the process ``ends`` with it, a second Ctrl-C ends it at once.
+    """
     follows = False
     try:
         if follows := torchrun.follows():  # the process that leads says the same
@@ -68,6 +74,8 @@ def _run_command(argv: list[str], errors: TextIO, streams: contextlib.ExitStack)
         returned = get_command(build()).main(argv, prog_name="hjepa", standalone_mode=False)
         return returned if isinstance(returned, int) else 0
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # the last resort
+        if ends:
+            end_at_once()
         if isinstance(error, SystemExit) and not blamed(error):
             raise  # of the shell's completion
         if "--debug" in argv or os.environ.get("HJEPA_DEBUG", "0") not in ("", "0"):

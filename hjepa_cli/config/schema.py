@@ -29,6 +29,7 @@ Width = Annotated[int, Meta(ge=1, le=WIDEST)]
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
+GreyLevels = Annotated[float, Meta(ge=0, le=255)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
 
 
@@ -119,7 +120,7 @@ class EncoderSettings:
     mirror: Literal["exact", "augment", "none"] = "exact"
     shift_px: CountOrNone = 8  # sideways; no further than every cart stays in the picture
     light_spread: BelowOne = 0.0  # training pictures: each trajectory in a light of 1 ± this
-    camera_noise: NotNegative = 0.0  # and with noise of up to this standard deviation, of 255
+    camera_noise: GreyLevels = 0.0  # and with noise of up to this standard deviation, of 255
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     gate: Annotated[
         bool,
@@ -279,9 +280,9 @@ class ConditionSettings:
     Beside ``protocol.plant_spread``; controllers do not know.
     """
 
-    light: Positive = 1.0  # factor on what the camera sees
-    camera_noise: NotNegative = 0.0  # standard deviation in every pixel, of 255
-    pole_length: Positive = 1.0  # ÷ the nominal one
+    light: Annotated[float, Meta(gt=0, le=255)] = 1.0  # factor on what the camera sees
+    camera_noise: GreyLevels = 0.0  # standard deviation in every pixel, of 255
+    pole_length: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # ÷ the nominal one
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.evaluation.entries import MethodEntries
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.workers import open_workers
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, UsageError, choices
 from hjepa_cli.output.screen import Screen, ticking
 from hjepa_cli.stages.model_set import ModelSet, how_to_train
 from hjepa_cli.stages.plan import seconds_of
@@ -195,7 +195,7 @@ def measure_points(
     settings, protocol = models.settings, models.settings.protocol
     if split_late(method)[0] not in models.methods:
         raise UsageError(
-            f"no model for method '{method}'; choose from {', '.join(models.methods)}",
+            f"no model for method '{method}'; {choices(method, models.methods)}",
             hint=how_to_train(method, settings),
         )
     points = [Point("gap", gap) for gap in gaps]

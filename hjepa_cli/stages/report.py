@@ -7,6 +7,7 @@ the commands that make it again. Figures can also be written as files for a pape
 import base64
 import csv
 import io
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ def run(
     directories = found_runs(paths)
     template = page_template()
     section = template.make_module(dict.fromkeys(("runs", "sections", "note"), ())).section
-    described, sections, written = [], [], []
+    described, sections, written, names = [], [], [], figure_names(directories)
     for directory in directories:
         one = describe(directory)
         try:
@@ -62,7 +63,8 @@ def run(
             raise results.damaged(directory, one["stage"], missing) from None
         described.append(one)
         if figures is not None:
-            written += write_figures(drawn, figures, one["stage"], formats)
+            name = names[directory]
+            written += write_figures(drawn, figures, name, formats)
     note = NO_RESULT if any(one["preset"] == runs.SMOKE for one in described) else ""
     text = template.render(runs=described, sections=sections, note=note)
     files.write_text(files.target(out), text)
@@ -182,17 +184,27 @@ def _svg(figure: Any) -> str:
     return base64.b64encode(encoded(figure, "svg")).decode()
 
 
-def write_figures(
-    drawn: Figures, directory: Path, stage: str, formats: Sequence[str]
-) -> list[Path]:
-    """Write figures as ``<stage>-<name>.<format>``."""
+def figure_names(directories: Sequence[Path]) -> dict[Path, str]:
+    """Return what the figures of each run begin with: its stage, of several also which run."""
+    names: dict[Path, str] = {}
+    for directory in directories:
+        stage = stage_of(directory)
+        alone = sum(stage_of(other) == stage for other in directories) == 1
+        name = stage if alone else f"{stage}-{directory.resolve().name}"
+        taken = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+        names[directory] = next(one for one in taken if one not in names.values())
+    return names
+
+
+def write_figures(drawn: Figures, directory: Path, run: str, formats: Sequence[str]) -> list[Path]:
+    """Write figures as ``<run>-<name>.<format>``."""
     if not drawn:
         return []
     from hjepa_cli.output.figures import save
 
     files.make_directory(directory)
     return [
-        save(figure, directory / f"{stage}-{name}.{kind}")
+        save(figure, directory / f"{run}-{name}.{kind}")
         for name, (_, figure) in drawn.items()
         for kind in formats
     ]

@@ -70,6 +70,7 @@ class _Row(msgspec.Struct):
     tolerance_ci95: Interval | None = None
     delay_steps: Whole | None = 0
     reports_per_block_slot: NotNegative | None = None
+    coverage: Annotated[float, Meta(ge=0, le=1)] | None = None
 
 
 class _Gain(msgspec.Struct):

@@ -161,6 +161,10 @@ class BySimulation:
                 for label in map(_label, lines)
             ],
         )
+        covered = {row["snr_db"]: row["coverage"] for row in result["rows"] if "coverage" in row}
+        if covered:
+            shares = ", ".join(f"{share:.0%} at {at:g} dB" for at, share in covered.items())
+            screen.result(f"devices of the hall whose power suffices at mean fading: {shares}")
         title, at = "simulated again, inside and outside each load", ("load", "devices/block")
         show_verdicts(result, screen, title, "method, scheduler", *at, digits=1)
         for found in result["gains"]:

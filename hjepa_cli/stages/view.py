@@ -35,7 +35,7 @@ from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.radio.channel import rayleigh_power_gains
 from hjepa_cli.core.radio.laws.equal import equal_devices
-from hjepa_cli.errors import MissingInputError, UsageError, require
+from hjepa_cli.errors import MissingInputError, UsageError, choices, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import CODECS, METHODS
@@ -220,8 +220,7 @@ def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) ->
     for name in settings.methods:
         if name not in viewable:
             raise UsageError(
-                f"method '{name}' cannot be viewed with this model; "
-                f"choose from {', '.join(viewable)}",
+                f"method '{name}' cannot be viewed with this model; {choices(name, viewable)}",
                 hint=f"hjepa view --methods {viewable[0]}",
             )
     return models

@@ -156,7 +156,7 @@ def read_bytes(path: Path, *, limit: int | None = None) -> bytes:
         DataError: larger than ``limit``, or not a regular file.
         StorageError: the disk refused.
     """
-    try:
+    with reading(path):
         if not path.is_file():
             if path.exists():
                 raise DataError(f"{path} is not a regular file")
@@ -165,6 +165,13 @@ def read_bytes(path: Path, *, limit: int | None = None) -> bytes:
         if limit is not None and size > limit:
             raise DataError(f"{path} is too large: {size} bytes, at most {limit} are accepted")
         return path.read_bytes()
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn every OSError inside the ``with`` block into a StorageError."""
+    try:
+        yield
     except OSError as error:
         raise StorageError(f"cannot read {path}: {error.strerror or error}") from None
 

@@ -281,7 +281,7 @@ def is_smoke(directory: Path) -> bool:
 
 
 def _ended_s(directory: Path) -> float:
-    """Return when a run wrote of itself last: copying and checking out change the times of files."""
+    """Return when a run wrote of itself last: copying and checking out change a file's time."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
         with open(directory / EVENTS, "rb") as file:
             file.seek(max(os.path.getsize(directory / EVENTS) - LAST_EVENTS_BYTES, 0))
@@ -335,7 +335,8 @@ def read_config(directory: Path) -> dict[str, Any]:
     """
     path = directory / CONFIG
     try:
-        found = tomllib.loads(files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode())
+        text = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode("utf-8-sig")
+        found = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid TOML: {error}") from None
     if (directory / ENVIRONMENT).exists():
