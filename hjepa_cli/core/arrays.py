@@ -33,16 +33,21 @@ def described(values: Any) -> str:
     """Say what an array or tensor is: ``float32 [2, 64, 128] from 0 to 0.97``."""
     shape = ", ".join(map(str, values.shape))
     text = f"{str(values.dtype).removeprefix('torch.')} [{shape}]"
-    if 0 in values.shape or getattr(values.dtype, "kind", "f") not in "biuf":
+    if 0 in values.shape or getattr(values.dtype, "kind", "f") not in "biuf" or "complex" in text:
         return text
     return f"{text} from {float(values.min()):.6g} to {float(values.max()):.6g}"
 
 
-def _numbers(values: ArrayLike, name: str) -> Floats:
+def array_from(values: ArrayLike, name: str) -> NDArray[Any]:
+    """Return anything as an array; raise ArrayError for what is none, as lists of many lengths."""
     try:
-        array = np.asarray(values)
+        return np.asarray(values)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ArrayError(f"{name} is no array: {error}") from None
+
+
+def _numbers(values: ArrayLike, name: str) -> Floats:
+    array = array_from(values, name)
     if array.dtype.kind not in "biuf":
         raise ArrayError(f"{name}: {described(array)}; expected real numbers")
     return np.asarray(array, np.float64)

@@ -50,6 +50,7 @@ class Evaluation:
     config: Mapping[str, Any]
     dataset: str | None
     training_seed: int | None
+    grids: Mapping[str, Any]
 
     def seed_of(self, method: str) -> int:
         """Return the training's seed, or of a method without a model the evaluation's."""
@@ -62,9 +63,7 @@ class Evaluation:
         sections = {name: self.config[name] for name in ("protocol", "conditions", "collect")}
         clean = (*curves.CLEAN, "start")
         sections["collect"] = {k: v for k, v in sections["collect"].items() if k in clean}
-        first = next(iter(self.result["methods"].values()), None)
-        grids = {} if first is None else _grids(first)
-        return {key: self.result[key] for key in ALIKE} | dotted(sections) | grids
+        return {key: self.result[key] for key in ALIKE} | dotted(sections) | self.grids
 
     def draws(self) -> dict[str, Any]:
         """Return what must agree within a training besides: methods share their draws there."""
@@ -174,6 +173,7 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
         config | {"preset": environment.get("preset")},
         dataset["sha256"] if isinstance(dataset, dict) else None,
         training_seed(directory, result["training_seeds"], entries),
+        _grids(next(iter(all_of.values()))) if all_of else {},
     )
 
 

@@ -56,11 +56,11 @@ class _Health(msgspec.Struct):
 class _Row(msgspec.Struct):
     snr_db: Number
     method: str
-    devices: Whole | None
-    devices_ci95: tuple[Whole, Whole] | None
+    devices: NotNegative | None
+    devices_ci95: Interval | None
     at_least: bool | None
     bits_per_s: NotNegative | None
-    bits_per_transmission: Whole | None = None
+    bits_per_transmission: NotNegative | None = None
     ratio_to_limit: NotNegative | None = None
     scheduler: str | None = None
     reason: str | None = None
@@ -68,7 +68,7 @@ class _Row(msgspec.Struct):
     load_ci95: Interval | None = None
     tolerance: NotNegative | None = None
     tolerance_ci95: Interval | None = None
-    delay_steps: Whole | None = 0
+    delay_steps: NotNegative | None = 0
     reports_per_block_slot: NotNegative | None = None
     coverage: Annotated[float, Meta(ge=0, le=1)] | None = None
 
@@ -116,6 +116,7 @@ class _Evaluation(msgspec.Struct):
 
 
 class _Scale(msgspec.Struct):
+    rows: Annotated[list[_Row], Meta(min_length=1)]
     seed: Whole
     acceptable_score: Number
     law: str
@@ -124,7 +125,6 @@ class _Scale(msgspec.Struct):
     n_devices: Whole
     limit_bits_per_s: NotNegative
     paper_gain_percent: Number
-    rows: Annotated[list[_Row], Meta(min_length=1)]
     gains: list[_Gain]
     csv: str = ""
     figures: list[str] = []

@@ -120,12 +120,12 @@ def test_other_states_are_refused_by_teachers_and_cart_poles(states):
         hjepa_cli.teacher("desktop")(states)
     pole = hjepa_cli.CartPole("desktop", seed=1)
     before = pole.state
+    scalar = states is None or isinstance(states, float)
     for set_ in (
         lambda: setattr(pole, "state", states),
-        lambda: pole.step(0.0, noise=np.zeros(3) if states is None or np.ndim(states) == 0
-                          else states),
-        lambda: pole.step(states if np.ndim(states) else "force"),
-    ):  # fmt: skip
+        lambda: pole.step(0.0, noise=np.zeros(3) if scalar else states),
+        lambda: pole.step("force" if scalar else states),
+    ):
         with pytest.raises(ArrayError):
             set_()
     assert (pole.state == before).all()

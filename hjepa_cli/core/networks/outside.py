@@ -7,7 +7,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from hjepa_cli.core.arrays import described, finite
+from hjepa_cli.core.arrays import array_from, described, finite
 from hjepa_cli.errors import ArrayError
 
 
@@ -18,7 +18,7 @@ def frames_from(frames: ArrayLike, shape: tuple[int, ...]) -> Tensor:
         ArrayError: another type or shape, such as floats from 0 to 1 or channels before rows.
         NumericalError: they are floats, and one is not finite.
     """
-    array = np.asarray(frames)
+    array = array_from(frames, "frames")
     if array.dtype != np.uint8:
         finite(array, "frames")
     if array.dtype != np.uint8 or array.shape[1:] != shape or array.ndim != 1 + len(shape):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hjepa_cli import plugins
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
-from hjepa_cli.core.arrays import Floats, described, finite
+from hjepa_cli.core.arrays import Floats, array_from, described, finite
 from hjepa_cli.core.plants.cartpole import camera
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
@@ -109,10 +109,7 @@ class Camera(camera.Camera):
 
 def _of_size(size: int, values: ArrayLike, name: str) -> NDArray[Any]:
     """Return so many values in one row; raise ArrayError for any other number of them."""
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise ArrayError(f"{name} is no array: {error}") from None
+    array = array_from(values, name)
     if array.size != size:
         raise ArrayError(f"{name}: {described(array)}; expected {size} finite numbers")
     return array.reshape(size)
