@@ -20,6 +20,21 @@ from hjepa_cli.cli.app import main
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "HJEPA_DEBUG": "0"}  # for child processes
 
+# The command line in a child that has no privilege over files: not even root passes permissions.
+UNPRIVILEGED = """
+import ctypes, os, sys
+if os.geteuid() == 0:
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable: twice 32
+    assert libc.capget(header, sets) == 0
+    for part in range(2):
+        sets[part] &= ~0b110  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH
+    assert libc.capset(header, sets) == 0
+from hjepa_cli.cli.app import main
+main(sys.argv[1:])
+"""
+
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:

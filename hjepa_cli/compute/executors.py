@@ -5,6 +5,7 @@ settings, seed and index alone, so that results do not depend on where or in whi
 may be computed twice after a failure.
 """
 
+import asyncio
 import dataclasses
 import functools
 import importlib.util
@@ -13,11 +14,17 @@ import logging
 import multiprocessing
 import os
 import signal
-import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -291,10 +298,22 @@ def check_answer(address: str) -> None:
     host, _, port = place.rpartition(":")
     if (sign and scheme != "tcp") or not port.isdecimal():
         return  # Dask says what is wrong with it
-    with socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S) as there:
-        begun = there.recv(8, socket.MSG_WAITALL)
+    with ThreadPoolExecutor(1) as beside:  # here a loop of the caller's may run, as in a notebook
+        begun = beside.submit(asyncio.run, _greeting(host.strip("[]"), int(port))).result()
     if len(begun) < 8 or int.from_bytes(begun, "little") > LONGEST_GREETING:
         raise OSError("what listens there is something else")
+
+
+async def _greeting(host: str, port: int) -> bytes:
+    """Return the first 8 bytes that are said there; fewer, if that is all."""
+    async with asyncio.timeout(CONNECT_S):
+        heard, there = await asyncio.open_connection(host, port)
+        try:
+            return await heard.readexactly(8)
+        except asyncio.IncompleteReadError as error:
+            return error.partial
+        finally:
+            there.close()
 
 
 def check_cluster(client: Any, where: str) -> None:

@@ -5,10 +5,10 @@ statistics of batch norm are summed over all processes, so a step is that of one
 whole batch, whatever their number; only the order of the sums differs.
 """
 
+import asyncio
 import dataclasses
 import datetime
 import os
-import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -150,7 +150,7 @@ def _meet(rank: int, size: int) -> dist.Store:
         try:
             if store is None:
                 if not serves:  # torch prints a page where nobody listens
-                    socket.create_connection((host, port), timeout=1).close()
+                    asyncio.run(_reach(host, port))
                 second = datetime.timedelta(seconds=1)
                 store = dist.TCPStore(host, port, size, serves, second, wait_for_workers=False)
                 store.set(here[rank], b"")
@@ -171,6 +171,12 @@ def _meet(rank: int, size: int) -> dist.Store:
             said = True
             torchrun.announce(f"process {rank}: waiting for {size} processes at {host}:{port}")
         time.sleep(POLL_S)
+
+
+async def _reach(host: str, port: int) -> None:
+    """Raise OSError unless somebody listens there."""
+    _, there = await asyncio.wait_for(asyncio.open_connection(host, port), timeout=1)
+    there.close()
 
 
 def all_reduce(tensor: Tensor) -> None:
