@@ -300,20 +300,24 @@ def check_answer(address: str) -> None:
         return  # Dask says what is wrong with it
     with ThreadPoolExecutor(1) as beside:  # here a loop of the caller's may run, as in a notebook
         begun = beside.submit(asyncio.run, _greeting(host.strip("[]"), int(port))).result()
-    if len(begun) < 8 or int.from_bytes(begun, "little") > LONGEST_GREETING:
+    if begun is not None and not 0 < int.from_bytes(begun, "little") < LONGEST_GREETING:
         raise OSError("what listens there is something else")
 
 
-async def _greeting(host: str, port: int) -> bytes:
-    """Return the first 8 bytes that are said there; fewer, if that is all."""
-    async with asyncio.timeout(CONNECT_S):
-        heard, there = await asyncio.open_connection(host, port)
-        try:
+async def _greeting(host: str, port: int) -> bytes | None:
+    """Return the first 8 bytes that are said there, empty without; ``None`` where nobody is."""
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            heard, there = await asyncio.open_connection(host, port)
+    except (OSError, TimeoutError):
+        return None  # Dask says so
+    try:
+        async with asyncio.timeout(CONNECT_S):
             return await heard.readexactly(8)
-        except asyncio.IncompleteReadError as error:
-            return error.partial
-        finally:
-            there.close()
+    except (OSError, TimeoutError, asyncio.IncompleteReadError):
+        return b""
+    finally:
+        there.close()
 
 
 def check_cluster(client: Any, where: str) -> None:
