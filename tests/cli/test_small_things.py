@@ -148,3 +148,19 @@ def test_sizes_of_conditions_are_those_of_things() -> None:
     ):
         with pytest.raises(UsageError, match=wrong):
             load_settings(flags=values)
+
+
+@pytest.mark.parametrize(
+    ("command", "fragment"),
+    [
+        ("view --devices 300", "300 devices: a GIF has room for 248"),
+        ("view --out a.txt", "no animation format '.txt'"),
+        ("view --fps 90", "a GIF holds at most 50"),
+        ("view --live", "--live needs a terminal"),
+        ("data export data --split train --out a.x", "no export format"),
+    ],
+)
+def test_a_dry_run_refuses_what_the_command_would(hjepa, command, fragment) -> None:
+    with hjepa.untouched():
+        for flags in ([], ["--dry-run"]):
+            assert_one_line_error(hjepa(*command.split(), *flags), 2, fragment)
