@@ -67,12 +67,6 @@ MEMORY = (
     ("compute/memory.py", "if need_bytes > (limit := limit_bytes()):", "limit = 0\n    if False:"),
 )
 NOT_HELD = ((FILES, "    if inode is None:\n        return\n", "    return\n"),)
-    (
-        EXECUTORS,
-        "        with worker_pool(count, prepare_worker) as pool:",
-        "        with worker_pool(count, print) as pool:",
-    ),
-)
 
 GUARDS: dict[str, tuple[Change, ...]] = {
     # 1 – 4: writing
@@ -373,7 +367,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         (APP, "if out is None or out.lost is None or code != 0:", "if True:"),
     ),
     "test_streams.py::test_an_error_keeps_its_code_where_it_cannot_be_told": (
-        (STREAMS, "            except OSError as error:\n                self.lost = error", "            except ZeroDivisionError as error:\n                self.lost = error"),
+        (STREAMS, "        except OSError as error:\n            self.lost = error", "        except ZeroDivisionError as error:\n            self.lost = error"),
     ),
     "test_streams.py::test_a_closed_stream_is_the_null_device": (
         (STREAMS, "    is_file = old is None or old.closed\n", "    is_file = False\n"),
@@ -385,7 +379,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         (STREAMS, "    _occupy()\n    before", "    before"),
     ),
     "test_streams.py::test_a_run_survives_a_full_log_disk": (
-        (STREAMS, "            except OSError as error:\n                self.lost = error", "            except ZeroDivisionError as error:\n                self.lost = error"),
+        (STREAMS, "        except OSError as error:\n            self.lost = error", "        except ZeroDivisionError as error:\n            self.lost = error"),
     ),
     # 34: launchers
     "test_launcher.py::test_a_variable_that_is_wrong_is_named": (

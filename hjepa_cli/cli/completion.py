@@ -1,6 +1,7 @@
 """The shell offers names that lie on this disk when TAB is pressed, read without torch."""
 
 import contextlib
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def payloads(incomplete: str) -> list[str]:
 
     names: list[str] = []
     for name in CODECS:
-        family = name.partition(" ")[0].rstrip("N0123456789")
+        family = name[: re.match(r"[a-z-]*", name).end()]  # type: ignore[union-attr]
         members = (f"{family}{number}" for number in range(2, 33))
         names += [one for one in (name, *members) if " " not in one and one in CODECS] or [family]
     return matching(list(dict.fromkeys(names)), incomplete)

@@ -8,10 +8,9 @@ away ends what it was reading, as everywhere in a shell.
 import contextlib
 import io
 import os
-import select
 import sys
 from collections.abc import Iterator
-from typing import Any, TextIO
+from typing import TextIO
 
 from hjepa_cli.errors import HjepaError, StorageError
 
@@ -22,8 +21,8 @@ class PipeClosed(HjepaError):
     exit_code = StorageError.exit_code
 
 
-class Lasting(io.FileIO):
-    """It is a descriptor that takes all that is written; ``lost`` is why some of it went nowhere.
+class Lasting(io.TextIOWrapper):
+    """It is a stream that takes all that is written; ``lost`` is why some of it went nowhere.
 
     The first time that a pipe has no reader is PipeClosed where ``ends``.
     """
@@ -31,18 +30,28 @@ class Lasting(io.FileIO):
     lost: OSError | None = None
     ends = False
 
-    def write(self, data: Any) -> int:
-        """Write bytes, waiting for a descriptor that does not; return how many are dealt with."""
-        while self.lost is None:
-            try:
-                if (count := super().write(data)) is not None:
-                    return count
-                select.select([], [self], [])
-            except OSError as error:
-                self.lost = error
-                if self.ends and isinstance(error, BrokenPipeError):
-                    raise PipeClosed("output closed") from None
-        return memoryview(data).nbytes
+    def write(self, text: str) -> int:
+        """Write a text as a stream does."""
+        with self._going_on():
+            return super().write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush as a stream does."""
+        with self._going_on():
+            super().flush()
+
+    @contextlib.contextmanager
+    def _going_on(self) -> Iterator[None]:
+        """Let what was refused, and all that follows, go to the null device."""
+        try:
+            yield
+        except OSError as error:
+            self.lost = error
+            _put_nowhere(self.fileno())
+            super().flush()  # what the refusal has left behind
+            if self.ends and isinstance(error, BrokenPipeError):
+                raise PipeClosed("output closed") from None
 
 
 @contextlib.contextmanager
@@ -54,8 +63,8 @@ def lasting_streams() -> Iterator[Lasting | None]:
     """
     _occupy()
     before = sys.stdout, sys.stderr
-    out, sys.stdout = _opened(sys.stdout, 1)
-    _, sys.stderr = _opened(sys.stderr, 2)
+    sys.stdout, sys.stderr = _opened(sys.stdout, 1), _opened(sys.stderr, 2)
+    out = sys.stdout if isinstance(sys.stdout, Lasting) else None
     if out is not None:
         out.ends = True
     try:
@@ -73,16 +82,21 @@ def _occupy() -> None:
         try:
             os.fstat(number)
         except OSError:
-            nowhere = os.open(os.devnull, os.O_RDWR)
-            if nowhere == number:
-                os.set_inheritable(number, True)  # processes that we start need one too
-            else:
-                os.dup2(nowhere, number)
-                os.close(nowhere)
+            _put_nowhere(number)
 
 
-def _opened(old: TextIO | None, number: int) -> tuple[Lasting | None, TextIO]:
-    """Return a stream in place of ``old``, and its descriptor where it is one of ours."""
+def _put_nowhere(number: int) -> None:
+    """Make a descriptor one of the null device, which processes that we start have too."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    if nowhere == number:
+        os.set_inheritable(number, True)
+    else:
+        os.dup2(nowhere, number)
+        os.close(nowhere)
+
+
+def _opened(old: TextIO | None, number: int) -> TextIO:
+    """Return a stream of ours in place of ``old``, where that is a file or nothing."""
     is_file = old is None or old.closed
     if old is not None and not is_file and type(old) is io.TextIOWrapper:
         with contextlib.suppress(OSError):  # a text that is no file
@@ -91,15 +105,15 @@ def _opened(old: TextIO | None, number: int) -> tuple[Lasting | None, TextIO]:
         if isinstance(old, io.TextIOWrapper):  # an ASCII-only terminal gets "?", not a crash
             old.reconfigure(errors="replace")
         assert old is not None
-        return None, old
+        return old
     with contextlib.suppress(OSError, ValueError, AttributeError):  # None, closed or full
         old.flush()  # type: ignore[union-attr]
-    raw = Lasting(number, "w", closefd=False)
-    text = io.TextIOWrapper(
-        io.BufferedWriter(raw),
+    with contextlib.suppress(OSError):  # else a slow reader would be an error
+        os.set_blocking(number, True)
+    return Lasting(
+        io.BufferedWriter(io.FileIO(number, "w", closefd=False)),
         encoding=getattr(old, "encoding", None) or "utf-8",
         errors="replace",
-        line_buffering=raw.isatty() or number == 2,
+        line_buffering=os.isatty(number) or number == 2,
         write_through=getattr(old, "write_through", False),
     )
-    return raw, text

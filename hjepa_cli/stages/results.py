@@ -189,6 +189,8 @@ def damaged(directory: Path, stage: str, reason: object, name: str = runs.RESULT
 
 def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     """Return what keeps a result from being shown, if anything."""
+    if stage not in RESULTS:
+        return "its stage is none of ours"
     try:
         msgspec.convert(result, RESULTS[stage])
         if "plant" in result:

@@ -314,7 +314,8 @@ def lock_directory(directory: Path) -> IO[bytes]:
 
 def identity(directory: Path) -> tuple[str, int]:
     """Return what tells a directory from another that is put in its place, and to whom it does."""
-    return platform.node(), directory.stat().st_ino
+    inode, _ = _HELD.get(os.path.abspath(directory), (None, None))  # once it was locked, for good
+    return platform.node(), directory.stat().st_ino if inode is None else inode
 
 
 @contextlib.contextmanager

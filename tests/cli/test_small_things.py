@@ -124,9 +124,9 @@ def test_a_number_that_fits_no_unit_has_no_suggestion(hjepa) -> None:
 def test_a_hall_that_covers_few_says_so(hjepa) -> None:
     """Devices whose power does not suffice are why there are none."""
     Path("c.toml").write_text("[radio]\npower_dbm = -40.0\n[protocol]\nsteps = 40\n")
-    radio = load_settings(config="c.toml").radio
-    share = hall_coverage(radio, 20.0, 0, 64)
-    assert share < 0.2 < hall_coverage(load_settings().radio, 20.0, 0, 64)
+    hall = {"radio.topology": "hall", "radio.law": "scheduled"}
+    share = hall_coverage(load_settings(config="c.toml", flags=hall).radio, 20.0, 0, 64)
+    assert share < 0.2 < hall_coverage(load_settings(flags=hall).radio, 20.0, 0, 64)
     words = ["--law", "scheduled", "--topology", "hall", "--scheduler", "round-robin"]
     words += ["--methods", "hold-true", "--preset", "smoke", "--config", "c.toml", "--snr", "20"]
     result = hjepa("scale", *words, "--json").document

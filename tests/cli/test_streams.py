@@ -105,3 +105,25 @@ def test_a_pipe_without_a_reader_ends_quietly(tmp_path: Path, command: str) -> N
     os.close(write_end)
     assert done.returncode == (66 if "info" in command else 74)
     assert b"Traceback" not in done.stderr and b"Exception" not in done.stderr
+
+
+def test_a_signal_at_the_moment_of_writing_doubles_nothing(tmp_path: Path) -> None:
+    """An interrupted write of ours would leave in the buffer what is out already."""
+    code = (
+        "import os, signal; from hjepa_cli.output import streams\n"
+        "with streams.lasting_streams() as out:\n"
+        "    signal.setitimer(signal.ITIMER_REAL, 0.001, 0.0005)\n"
+        "    signal.signal(signal.SIGALRM, lambda *_: 1 / 0)\n"
+        "    number = 0\n"
+        "    while number < 3000:\n"
+        "        try:\n"
+        "            number += 1; print(number, flush=True)\n"
+        "        except ZeroDivisionError:\n"
+        "            pass\n"
+        "    signal.setitimer(signal.ITIMER_REAL, 0)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True
+    )
+    numbers = [line for line in done.stdout.splitlines() if line]
+    assert len(numbers) == len(set(numbers)) and len(numbers) > 1000, done.stderr
