@@ -326,7 +326,7 @@ def holding(directory: Path, which: tuple[str, int]) -> Iterator[None]:
         yield
         return
     before = _HELD.get(key := os.path.abspath(directory))
-    _HELD[key] = inode, None
+    _HELD[key] = before if before is not None and before[0] == inode else (inode, None)
     try:
         yield
     finally:

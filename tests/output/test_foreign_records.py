@@ -157,4 +157,4 @@ def test_an_unreadable_shard_is_one_of_them(shell, monkeypatch) -> None:
     with open("data/shard-00001.safetensors", "ab") as file:
         file.write(b"x")
     failed = shell("data", "verify", "data", "--quiet")
-    assert_one_line_error(failed, 74, "2 files", "Input/output error", "shard-00001")
+    assert_one_line_error(failed, 65, "2 files", "Input/output error", "shard-00001")
