@@ -294,7 +294,7 @@ def read_regular(path: Path) -> str:
         raise ValueError("not a regular file")
     if path.stat().st_size > LIMIT_BYTES:
         raise ValueError(f"larger than {LIMIT_BYTES} bytes")
-    return path.read_text(encoding="utf-8")
+    return path.read_text(encoding="utf-8-sig")  # editors of some systems begin with a mark
 
 
 def ensure(sources: Iterable[Source]) -> None:

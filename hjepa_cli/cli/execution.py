@@ -11,20 +11,14 @@ from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 
 from hjepa_cli.cli.commands import Command, Given
-from hjepa_cli.compute import torchrun
+from hjepa_cli.compute import memory, torchrun
 from hjepa_cli.compute.interrupts import exit_code, sigterm_raises
 from hjepa_cli.config.checks import resolve
 from hjepa_cli.config.schema import declared
 from hjepa_cli.config.settings import locate
-from hjepa_cli.errors import HjepaError, Interrupted, StorageError, Unsealed, UsageError
+from hjepa_cli.errors import Interrupted, Unlocked, Unsealed, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan
-
-
-class PipeClosed(HjepaError):
-    """Whoever read our output has gone, as in ``hjepa scale | head -1``: we end without a word."""
-
-    exit_code = StorageError.exit_code
 
 
 def execute(command: Command, given: Given) -> None:
@@ -45,6 +39,7 @@ def execute(command: Command, given: Given) -> None:
             planned = plan(**{name: inputs[name] for name in wanted})
             if not isinstance(planned, Plan):
                 raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")
+            memory.check(planned.memory_bytes, command.name)
             planned.show(screen)
             return
         from hjepa_cli.compute.executors import placed
@@ -94,12 +89,11 @@ def _guard(screen: Screen) -> Iterator[None]:
     """Catch what Typer would turn into exit codes of its own, and say warnings in our words."""
     try:
         with sigterm_raises(), warnings.catch_warnings():
-            warnings.simplefilter("default", Unsealed)
+            for ours in (Unsealed, Unlocked):
+                warnings.simplefilter("default", ours)
             warnings.showwarning = lambda message, *_, **__: screen.say(f"warning: {message}")
             yield
     except KeyboardInterrupt as error:
         raise Interrupted(
             "interrupted", hint="run the same command again", code=exit_code(error)
         ) from None
-    except BrokenPipeError:
-        raise PipeClosed("output closed") from None

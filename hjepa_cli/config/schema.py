@@ -19,12 +19,17 @@ LARGEST = sys.float_info.max  # bounds what is not bounded otherwise: no infinit
 LARGEST_SEED = 2**63 - 1
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 
-Count = Annotated[int, Meta(ge=1)]
-CountFromTwo = Annotated[int, Meta(ge=2)]  # nothing is learned without a next one
-CountOrNone = Annotated[int, Meta(ge=0)]
+MOST = 10**9  # of anything: beyond what any machine holds or any program counts
+WIDEST = 2**16  # values of an embedding or a layer
+
+Count = Annotated[int, Meta(ge=1, le=MOST)]
+CountFromTwo = Annotated[int, Meta(ge=2, le=MOST)]  # nothing is learned without a next one
+CountOrNone = Annotated[int, Meta(ge=0, le=MOST)]
+Width = Annotated[int, Meta(ge=1, le=WIDEST)]
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
+GreyLevels = Annotated[float, Meta(ge=0, le=255)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
 Candidates = Annotated[int, Meta(ge=4, le=10_000)]  # of a round of CMA-ES
 Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
@@ -93,8 +98,8 @@ class EncoderSettings:
         Count,
         Flag("--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
     ] = 2
-    embedding: Count = 256
-    hidden: Count = 1024
+    embedding: Width = 256
+    hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
     frame_input: Literal["difference", "pair"] = "difference"
     stride_actions: Literal["all", "held"] = "all"
@@ -117,7 +122,7 @@ class EncoderSettings:
     mirror: Literal["exact", "augment", "none"] = "exact"
     shift_px: CountOrNone = 8  # sideways; no further than every cart stays in the picture
     light_spread: BelowOne = 0.0  # training pictures: each trajectory in a light of 1 ± this
-    camera_noise: NotNegative = 0.0  # and with noise of up to this standard deviation, of 255
+    camera_noise: GreyLevels = 0.0  # and with noise of up to this standard deviation, of 255
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     gate: Annotated[
         bool,
@@ -146,7 +151,7 @@ class EncoderSettings:
 class ActorSettings:
     """Both training stages fit the semantic actor."""
 
-    hidden: Count = 1024
+    hidden: Width = 1024
     dropout: BelowOne = 0.2
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     learning_rate: NotNegative = 1e-3
@@ -338,9 +343,9 @@ class ConditionSettings:
     Beside ``protocol.plant_spread``; controllers do not know.
     """
 
-    light: Positive = 1.0  # factor on what the camera sees
-    camera_noise: NotNegative = 0.0  # standard deviation in every pixel, of 255
-    pole_length: Positive = 1.0  # ÷ the nominal one
+    light: Annotated[float, Meta(gt=0, le=255)] = 1.0  # factor on what the camera sees
+    camera_noise: GreyLevels = 0.0  # standard deviation in every pixel, of 255
+    pole_length: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # ÷ the nominal one
 
 
 @dataclasses.dataclass(frozen=True)

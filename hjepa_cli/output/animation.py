@@ -23,7 +23,8 @@ from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.pictures import FAINT, INK, PAPER, font
 from hjepa_cli.storage import files
 
-FORMATS = (".gif", ".mp4")
+MOST_PX = {".gif": 2**16 - 1, ".mp4": 2**14}  # each way: of the format, of the encoder
+FORMATS = tuple(MOST_PX)
 SCALE = 2  # a frame's pixel is so many of the picture
 PANEL_PX = (WIDTH_PX * SCALE, HEIGHT_PX * SCALE + 16 + 14)  # text above, strip below
 MARGIN_PX, TITLE_PX, HEADER_PX = 8, 20, 34
@@ -54,10 +55,7 @@ class Pictures:
         self.devices = link.delivered.shape[1]
         self._legend = "dashed: what the controller believes; bar: packet arrived"
         self._legend += "; tick: lost" * link.sends_always + link.late.replace(",", ";", 1)
-        panels = self.devices * (PANEL_PX[0] + MARGIN_PX) + MARGIN_PX
-        width = max(panels, LEAST_WIDTH_PX, int(TEXT.getlength(self._legend)) + 2 * MARGIN_PX)
-        height = len(films) * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX
-        self.size_px = (width + width % 2, height + height % 2)  # MP4 wants even sizes
+        self.size_px = size_px(self.devices, len(films), self._legend)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -145,10 +143,26 @@ class Pictures:
                 draw.line([(column, bottom - 2), (column, bottom)], fill=LOST)
 
 
-def check_target(path: Path, fps: int) -> None:
+def size_px(devices: int, methods: int, legend: str = "") -> tuple[int, int]:
+    """Return width and height of a picture: even numbers, as MP4 wants."""
+    panels, words = devices * (PANEL_PX[0] + MARGIN_PX), int(TEXT.getlength(legend)) + MARGIN_PX
+    width = max(panels + MARGIN_PX, LEAST_WIDTH_PX, words + MARGIN_PX)
+    height = methods * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX
+    return width + width % 2, height + height % 2
+
+
+def check_target(path: Path, fps: int, devices: int, methods: int) -> None:
     """Raise UsageError or MissingInputError for a file that we could not write, in good time."""
     if path.suffix not in FORMATS:
         raise UsageError(f"no animation format '{path.suffix}'; --out FILE.gif or FILE.mp4")
+    most = MOST_PX[path.suffix]
+    for what, count, across in (("devices", devices, 0), ("methods", methods, 1)):
+        if size_px(devices, methods)[across] > most:
+            fitting = max(n for n in range(count) if size_px(n, n)[across] <= most)
+            raise UsageError(
+                f"{count} {what}: a {path.suffix[1:].upper()} has room for {fitting}",
+                hint=f"--{what} with at most {fitting}; eval measures any number",
+            )
     if path.suffix == ".gif" and fps > MOST_GIF_FPS:
         raise UsageError(
             f"--fps {fps}: a GIF holds at most {MOST_GIF_FPS} pictures per second",

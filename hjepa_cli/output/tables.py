@@ -8,11 +8,16 @@ from hjepa_cli.core.evaluation.protocol import BESIDE
 from hjepa_cli.output.screen import Screen, described_steps, tolerance
 
 
+def measured(value: float | None) -> str:
+    """Set a number with three decimals, or say that there is none."""
+    return "undefined" if value is None else f"{value:.3f}"
+
+
 def show_gates(screen: Screen, gates: dict[str, dict[str, Any]], *, enforced: bool) -> None:
     """Print a row per gate."""
     rows = [
         [
-            *(name, f"{gate['value']:.3f}"),
+            *(name, measured(gate["value"])),
             f"{'≤' if name == 'actor_nrmse' else '≥'} {gate['threshold']:g}",
             "passed" if gate["passed"] else "FAILED",
         ]
@@ -30,7 +35,7 @@ def show_hierarchy(result: dict[str, Any], screen: Screen) -> None:
         f"{result.get('method', 'hjepa')} alone after one packet: NMAE by steps "
         f"({result['n_rollouts']} clean rollouts); actor NRMSE and action sensitivity held out",
         [*windows, "actor NRMSE", "sensitivity"],
-        [[f"{value:.3f}" for value in (*windows.values(), *held_out)]],
+        [[measured(value) for value in (*windows.values(), *held_out)]],
     )
 
 

@@ -21,6 +21,7 @@ from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import LAWS
+from hjepa_cli.stages import results
 from hjepa_cli.stages.evaluate import reads_of
 from hjepa_cli.stages.measuring import plan_curves, seconds_of_loops
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -72,7 +73,7 @@ def run(
     if "remeasure" in LAWS[radio.law].uses:
         given["remeasure"] = remeasure
     with Run.create("scale", out, settings.as_dict(), count.models.inputs(**given)) as record:
-        result = record.result
+        result = recorded = record.result
         if result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
         else:
@@ -94,9 +95,10 @@ def run(
             result["csv"] = write_csv(record.path("devices.csv"), result["rows"], count.columns)
             result["figures"] = draw(result, record.directory, screen)
             result = record.finish(result)
-        count.show(result)
-        screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
-        enforce(result)
+        with results.showing("scale", recorded, record.directory):
+            count.show(result)
+            screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
+            enforce(result)
         return result
 
 

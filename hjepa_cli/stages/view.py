@@ -5,12 +5,14 @@ pole, the pole that a linear probe reads from the controller's current embedding
 SNR and the age of the last packet. It shows a handful of devices; numbers come from ``eval``.
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Integers
@@ -24,6 +26,7 @@ from hjepa_cli.core.control.loop import (
     Draws,
     Floats,
     LinkDraws,
+    check_memory,
     gap_schedule,
     simulate,
     takes_ages,
@@ -37,7 +40,7 @@ from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.radio.channel import rayleigh_power_gains
 from hjepa_cli.core.radio.laws.equal import equal_devices
-from hjepa_cli.errors import MissingInputError, UsageError, require
+from hjepa_cli.errors import MissingInputError, UsageError, choices, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import CODECS, METHODS
@@ -120,15 +123,12 @@ def run(
             do not write, more pictures per second than a GIF holds, no terminal.
         MissingInputError: no model, or a library is missing.
     """
-    require("PIL", "a view needs Pillow", "plot")
+    check(settings, screen, out=out, devices=devices, every=every, fps=fps, live=live)
     from hjepa_cli.output import animation
     from hjepa_cli.output import live as terminal
 
     if not live:
-        animation.check_target(out, fps)
         out = files.target(out)
-    elif not screen.is_terminal:
-        raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
     models = open_viewable(settings, screen, checkpoint)
     link = make_link(settings, models.model, devices, snr_db, delivery, gap_steps)
     screen.say(link.label + link.late)
@@ -158,10 +158,45 @@ def run(
     return result
 
 
+def check(
+    settings: Settings,
+    screen: Screen,
+    *,
+    out: Path,
+    devices: int,
+    every: int | None,
+    fps: int,
+    live: bool,
+) -> None:
+    """Refuse what could not be drawn, before any work; arguments and errors as of :func:`run`."""
+    require("PIL", "a view needs Pillow", "plot")
+    from hjepa_cli.output import animation
+
+    check_memory(settings.protocol, devices)
+    if live:
+        if not screen.is_terminal:
+            raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
+        return
+    animation.check_target(out, fps, devices, len(settings.methods))
+    steps = settings.protocol.total_steps
+    pictures = steps // every if every else 100
+    size = math.prod(animation.size_px(devices, len(settings.methods)))
+    memory.check(pictures * size, f"{pictures} pictures of {devices} devices")
+
+
 def plan(
-    settings: Settings, *, checkpoint: str | None, out: Path, devices: int, live: bool
+    settings: Settings,
+    screen: Screen,
+    *,
+    checkpoint: str | None,
+    out: Path,
+    devices: int,
+    every: int | None,
+    fps: int,
+    live: bool,
 ) -> Plan:
     """Plan a film; arguments as of :func:`run`."""
+    check(settings, screen, out=out, devices=devices, every=every, fps=fps, live=live)
     models = open_viewable(settings, Screen(quiet=True), checkpoint)
     steps, methods = settings.protocol.total_steps, settings.methods
     frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
@@ -200,8 +235,7 @@ def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) ->
     for name in settings.methods:
         if name not in viewable:
             raise UsageError(
-                f"method '{name}' cannot be viewed with this model; "
-                f"choose from {', '.join(viewable)}",
+                f"method '{name}' cannot be viewed with this model; {choices(name, viewable)}",
                 hint=f"hjepa view --methods {viewable[0]}",
             )
     return models

@@ -26,6 +26,7 @@ CASES = {
     "Checkpoint": 280,
     "Dataset": 230,
     "Curves": 180,
+    "Shown": 120,
     "Records": 110,
     "Progress": 80,
     "Toml": 105,

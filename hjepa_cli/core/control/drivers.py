@@ -24,7 +24,7 @@ from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, UsageError, choices
 from hjepa_cli.plugins import CODECS, METHODS
 
 
@@ -145,6 +145,6 @@ def planner_of(model: Model, method: str) -> Planner:
     """
     planners = {name: made for name in methods_of(model) if (made := METHODS[name].planner)}
     if method not in planners:
-        raise UsageError(f"this model has no planner '{method}'; choose from {', '.join(planners)}")
+        raise UsageError(f"this model has no planner '{method}'; {choices(method, planners)}")
     planner: Planner = planners[method](model)
     return planner

@@ -17,12 +17,14 @@ import inspect
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats
@@ -63,6 +65,12 @@ Those before a device was switched on are copies of its first; see
 """
 
 
+def check_memory(protocol: ProtocolSettings, devices: int) -> None:
+    """Raise OutOfMemory where the draws of a closed loop do not fit."""
+    values = protocol.total_steps * devices * (len(protocol.half_widths) + 1)
+    memory.check(16 * values, f"a loop of {devices} devices over {protocol.total_steps} steps")
+
+
 @dataclasses.dataclass(frozen=True)
 class Draws:
     """Holds all random numbers of the closed loop, common to all methods and curve points.
@@ -89,6 +97,7 @@ class Draws:
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
         """Draw for ``devices`` devices, all derived from ``seed``."""
+        check_memory(protocol, devices)
         states = len(protocol.half_widths)
         initial = np.empty((devices, states))
         noise = np.empty((protocol.total_steps, devices, states))
@@ -260,7 +269,7 @@ def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
     Raises:
         UsageError: a gap D, whole or fractional, that is below 1 or infinite.
     """
-    if not 1 <= gap_steps < math.inf:
+    if not isinstance(gap_steps, Real) or not 1 <= gap_steps < math.inf:
         raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer, and finite")
     phases = gap_steps * np.fmod(np.arange(devices) * GOLDEN, 1.0)
     periods = np.arange(int(steps / gap_steps) + 1)
@@ -291,7 +300,7 @@ def delivery_schedule(probability: float, delivery: Floats) -> Bools:
     Raises:
         UsageError: p outside 0 … 1.
     """
-    if not 0 <= probability <= 1:
+    if not isinstance(probability, Real) or not 0 <= probability <= 1:
         raise UsageError(f"delivery probability {probability}; it lies between 0 and 1")
     schedule = delivery < probability
     schedule[0] = True

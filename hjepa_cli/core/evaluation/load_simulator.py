@@ -163,6 +163,12 @@ class LoadSimulator(Simulator):
         return known[:devices]
 
 
+def hall_coverage(radio: RadioSettings, snr_db: float, seed: int, devices: int) -> float:
+    """Return the share of devices in a hall whose power suffices for an SNR at mean fading."""
+    margin_db, _ = _links(radio, snr_db, seed, devices)
+    return float(np.mean(np.asarray(margin_db) >= 0))
+
+
 def _links(
     radio: RadioSettings, snr_db: float, seed: int, devices: int
 ) -> tuple[float | Floats, float | Floats]:
