@@ -20,7 +20,7 @@ from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.statistics import student_interval
-from hjepa_cli.errors import DataError, MissingInputError, require, shell
+from hjepa_cli.errors import DataError, MissingInputError, UsageError, require, shell
 from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.report import NO_RESULT, found_runs, inputs_of, stage_of
@@ -182,6 +182,9 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
     try:
         msgspec.convert(result, _Result)
         msgspec.convert(config, _Config)
+        plant(result["plant"])
+    except UsageError as error:
+        return error.message
     except msgspec.ValidationError as error:
         return f"{error} (an older version?)"
     steps, first = len(result["horizon"]), next(iter(result["methods"].values()), None)

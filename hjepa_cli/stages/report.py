@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefi
 
 from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import MissingInputError, shell
+from hjepa_cli.errors import MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
 from hjepa_cli.stages import results
 from hjepa_cli.storage import files, runs
@@ -61,6 +61,8 @@ def run(
         except (UndefinedError, LookupError, TypeError, ValueError, ArithmeticError) as error:
             missing = str(error).rpartition("has no attribute ")[2]
             raise results.damaged(directory, one["stage"], missing) from None
+        except UsageError as error:  # of a plant that no plugin in force adds
+            raise results.damaged(directory, one["stage"], error) from None
         described.append(one)
         if figures is not None:
             name = names[directory]

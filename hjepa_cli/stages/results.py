@@ -24,7 +24,7 @@ NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=1e-100, le=LARGEST)]
 Whole = Annotated[int, Meta(ge=0, le=10**18)]
 Interval = tuple[NotNegative, NotNegative]
-Windows = Annotated[dict[str, Number | None], Meta(min_length=1)]
+Windows = dict[str, Number | None]
 
 
 class _Gate(msgspec.Struct):
@@ -34,23 +34,18 @@ class _Gate(msgspec.Struct):
 
 
 class _Strides(msgspec.Struct):
-    h: Whole
-    m: Whole
-    l: Whole
+    h: Whole | str
+    m: Whole | str
+    l: Whole | str
 
 
 class _Decay(msgspec.Struct):
-    gain: Number
-    tau_steps: Number
+    gain: Number | None = None
+    tau_steps: Number | None = None
 
 
-class _Reflex(_Decay):
+class _Reflex(_Decay, kw_only=True):
     law: _Decay
-
-
-class _Health(msgspec.Struct):
-    actor_nrmse: Number | None
-    action_sensitivity: Number | None
 
 
 class _Row(msgspec.Struct):
@@ -93,8 +88,6 @@ class _Encoder(_Trained):
 class _Hierarchy(_Trained):
     strides: _Strides
     nmae_windows: Windows
-    n_rollouts: Whole
-    health: _Health
     method: str = "hjepa"
 
 
@@ -193,9 +186,7 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
         return "its stage is none of ours"
     try:
         msgspec.convert(result, RESULTS[stage])
-        if "plant" in result:
-            plant(result["plant"])
-    except (msgspec.ValidationError, UsageError) as error:
+    except msgspec.ValidationError as error:
         return str(error)
     if stage == "eval":
         entries = result["methods"]

@@ -67,7 +67,6 @@ RESULTS = [
     ("eval-0", put("methods", "hjepa", "nmae_windows", value={})),
     ("eval-0", put("methods", "hjepa", "nmae_windows", "1-20", value="x")),
     ("eval-0", drop("methods", "hjepa", "gap_curve")),
-    ("eval-0", put("plant", value="gone")),
     ("eval-0", put("plant", value=3)),
     ("eval-0", put("checkpoint", value=7)),
     ("scale", put("rows", value=[])),
@@ -104,6 +103,15 @@ def test_a_result_that_is_none_of_its_stage_is_refused(shell, run, edit) -> None
     if run.startswith("eval"):
         failed = shell("compare", "runs/eval-0", "runs/eval-1", "--quiet")
         assert failed.code in (65, 66, 0) and "unexpected" not in failed.err, failed
+
+
+def test_a_plant_that_nobody_knows_is_refused(shell, monkeypatch) -> None:
+    monkeypatch.undo()  # figures are drawn, with its control step
+    monkeypatch.chdir(shell.directory)
+    change(Path("runs/eval-0", runs.RESULT), put("plant", value="gone"))
+    assert_one_line_error(shell("report", "runs/eval-0", "--quiet"), 65, "unknown plant 'gone'")
+    failed = shell("compare", "runs/eval-0", "runs/eval-1", "--quiet")
+    assert_one_line_error(failed, 65, "unknown plant 'gone'")
 
 
 @pytest.mark.parametrize(("run", "edit"), ENVIRONMENTS)

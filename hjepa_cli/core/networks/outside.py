@@ -44,4 +44,5 @@ def embeddings_from(z: Any, width: int) -> Tensor:
         raise ArrayError(f"z: {described(z.detach().cpu())}; expected floating [N, {width}]")
     if not z.isfinite().all():
         finite(z.detach().float().cpu(), "z")
-    return z
+    checked: Tensor = z
+    return checked

@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,6 +23,7 @@ from hjepa_cli.errors import HjepaError, UsageError
 
 # The others wait that long: for the first process while it examines the encoder, most of all.
 TIMEOUT = datetime.timedelta(minutes=30)
+_untyped: Any = dist  # its stores have no types
 QUIET_S, POLL_S = 3.0, 0.05  # processes that start together differ by a second or so
 
 
@@ -133,7 +135,7 @@ def joined(device: torch.device, items: int) -> Iterator[Ranks]:
         dist.destroy_process_group()
 
 
-def _meet(rank: int, size: int) -> dist.Store:
+def _meet(rank: int, size: int) -> Any:
     """Wait until all processes are there, say so where it takes long, and return what they share.
 
     torch would wait for half an hour without a word, deaf to Ctrl-C and SIGTERM.
@@ -152,11 +154,11 @@ def _meet(rank: int, size: int) -> dist.Store:
                 if not serves:  # torch prints a page where nobody listens
                     asyncio.run(_reach(host, port))
                 second = datetime.timedelta(seconds=1)
-                store = dist.TCPStore(host, port, size, serves, second, wait_for_workers=False)
-                store.set(here[rank], b"")
+                store = _untyped.TCPStore(host, port, size, serves, second, wait_for_workers=False)
+                store.set(here[rank], "")
             if store.check(here):
                 store.set_timeout(TIMEOUT)
-                return dist.PrefixStore(attempt, store)
+                return _untyped.PrefixStore(attempt, store)
         except (dist.DistError, OSError) as error:
             if serves:
                 raise UsageError(
