@@ -13,6 +13,7 @@ from typing import Any
 
 from hjepa_cli.config.checks import check_cell
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.capacity import parse_snr
@@ -22,6 +23,7 @@ from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import ALLOCATION, show_allocations
 from hjepa_cli.plugins import LAWS
+from hjepa_cli.stages import results
 from hjepa_cli.stages.evaluate import reads_of
 from hjepa_cli.stages.measuring import plan_curves, seconds_of_loops
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -73,7 +75,7 @@ def run(
     if "remeasure" in LAWS[radio.law].uses:
         given["remeasure"] = remeasure
     with Run.create("scale", out, settings.as_dict(), count.models.inputs(**given)) as record:
-        result = record.result
+        result = recorded = record.result
         if result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
         else:
@@ -82,6 +84,7 @@ def run(
                 "plant": settings.plant,
                 "seed": settings.seed,
                 "acceptable_score": settings.protocol.acceptable_score,
+                "link": link.facts(settings.protocol, len(kind.force_signs)),
                 "law": radio.law,
                 "phy": radio.phy,
                 **({} if radio.phy == "shannon" else {"nr": settings.as_dict()["nr"]}),
@@ -96,10 +99,11 @@ def run(
             result["csv"] = write_csv(record.path("devices.csv"), result["rows"], count.columns)
             result["figures"] = draw(result, record.directory, screen)
             result = record.finish(result)
-        count.show(result)
-        show_allocations(result["rows"], screen)
-        screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
-        enforce(result)
+        with results.showing("scale", recorded, record.directory):
+            count.show(result)
+            show_allocations(result["rows"], screen)
+            screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
+            enforce(result)
         return result
 
 

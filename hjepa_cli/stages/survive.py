@@ -5,6 +5,7 @@ control for a given time, and how many devices a cell has at that transfer inter
 the form of TS 22.104's.
 """
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,8 @@ import numpy as np
 
 from hjepa_cli.config.checks import check_cell, check_methods, split_late
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
+from hjepa_cli.core.control.loop import check_memory
 from hjepa_cli.core.evaluation import survival
 from hjepa_cli.core.evaluation.load_simulator import PacketBits
 from hjepa_cli.core.evaluation.simulator import BLOCK_LOOPS, Simulator, Tick
@@ -28,6 +31,7 @@ from hjepa_cli.core.radio.laws.duty import duty_devices
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen, span, ticking
 from hjepa_cli.plugins import METHODS
+from hjepa_cli.stages import results
 from hjepa_cli.stages.measuring import cached, seconds_of_loops
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -71,16 +75,17 @@ def run(
     """
     models, methods = opened(settings, screen, checkpoint, further)
     with Run.create("survive", out, settings.as_dict(), models.inputs()) as record:
-        result = record.result
+        result = recorded = record.result
         if result is None:
             result = measured(models, methods, screen, record)
             result["figures"] = draw(result, record.directory, screen)
             result = record.finish(result)
         else:
             screen.say(f"{record.directory} is finished; this is its result")
-        show(result, screen)
-        if result["figures"]:
-            screen.say(f"written: {', '.join(map(str, result['figures']))}")
+        with results.showing("survive", recorded, record.directory):
+            show(result, screen)
+            if result["figures"]:
+                screen.say(f"written: {', '.join(map(str, result['figures']))}")
         return result
 
 
@@ -134,6 +139,9 @@ def opened(
                 "steps after a silence; expected no more",
                 hint=f"--intervals {min(watched, 10)}",
             )
+    longest = Trial.of(protocol, max(settings.survival.intervals_steps)).steps(protocol.gaps[-1])
+    lived = dataclasses.replace(protocol, warmup_steps=0, steps=longest)
+    check_memory(lived, settings.survival.loops)
     linked = [name for name in settings.methods if METHODS[split_late(name)[0]].needs_link]
     models = open_model_set(settings, screen, checkpoint, None, further)
     methods = models.measurable(linked)
@@ -205,6 +213,7 @@ def measured(
         "n_loops": options.loops,
         "settle_steps": Trial.of(settings.protocol, 1).settle_steps,
         "watch_steps": Trial.of(settings.protocol, 1).watch_steps,
+        "link": link.facts(settings.protocol, len(plant.force_signs)),
         "phy": settings.radio.phy,
         "bandwidth_hz": settings.radio.bandwidth_hz,
         "loss": options.loss,
@@ -463,7 +472,7 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
     ]
     screen.table(
         f"one gap between packets, {result['plant']}, seed {result['seed']}, {result['n_loops']} "
-        f"loops, 95 % CI (Clopper-Pearson)",
+        f"loops{link.described(result.get('link', {}))}, 95 % CI (Clopper-Pearson)",
         ["method", "interval [ms]", "gap [ms]", "lost", "left the band", "back after [ms]", "95 %"],
         gaps,
     )

@@ -12,9 +12,10 @@ from hjepa_cli.core.evaluation import survival
 from hjepa_cli.core.evaluation.simulator import Simulator
 from hjepa_cli.core.evaluation.survival import Gaps, LossCurve, LossyLink, Trial
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import DataError, OutOfMemory, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import survive
+from hjepa_cli.stages import report, survive
+from hjepa_cli.storage import seals
 
 SETTINGS = {
     "protocol.warmup_steps": 300,
@@ -163,6 +164,21 @@ def test_loops_of_a_block_are_those_of_the_whole():
     assert np.array_equal(whole.back_steps[1:, 4:], part.back_steps)
 
 
+@pytest.mark.parametrize("unit", ["counted", "by splitting"])
+def test_silences_over_a_link_that_is_late_and_loses_forces(unit):
+    """Packets of 40 ms ago, and one force in a hundred, each lose more than half of the loops."""
+    trial, found = Trial(10, 100, 100), []
+    for link in ({}, {"protocol.delay_steps": 40}, {"protocol.downlink_loss": 0.99}):
+        simulator = Simulator(load_settings(flags=SETTINGS | link), None)
+        gaps = Gaps("hold-true", trial, (180,), 0, 48)
+        if unit == "counted":
+            found.append(gaps.compute(simulator, lambda n: None).lost.mean())
+        else:
+            rare = survival.Rare("hold-true", trial, 180, 48)
+            found.append(rare.compute(simulator, lambda n: None)[0])
+    assert found[0] < 0.2 and found[1] > 0.5 and found[2] > 0.5, found
+
+
 def test_the_stage_ranks_prediction_over_holding(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = load_settings(flags=SETTINGS)
@@ -178,6 +194,16 @@ def test_the_stage_ranks_prediction_over_holding(tmp_path, monkeypatch):
     again = survive.run(settings, Screen(quiet=True), out=tmp_path / "runs" / "survive" / "0001")
     assert again["rows"] == json.loads(json.dumps(result["rows"]))
     assert "drive 24 loops" in survive.plan(settings).work[0]
+    report.run(Screen(quiet=True), [tmp_path / "runs"], out=tmp_path / "report.html")
+    for edit in ({"step_s": 0}, {"rows": []}, {"curves": None}, {"n_loops": "many"}):
+        path = tmp_path / "runs" / "survive" / "0001" / "result.json"
+        whole = path.read_text()
+        path.write_text(json.dumps(seals.sealed(json.loads(whole) | edit)))
+        with pytest.raises(DataError, match="result.json lacks what a survive run has"):
+            report.run(Screen(quiet=True), [tmp_path / "runs"], out=tmp_path / "report.html")
+        with pytest.raises(DataError, match="result.json lacks what a survive run has"):
+            survive.run(settings, Screen(quiet=True), out=path.parent)
+        path.write_text(whole)
 
 
 @pytest.mark.parametrize(
@@ -191,3 +217,9 @@ def test_the_stage_ranks_prediction_over_holding(tmp_path, monkeypatch):
 def test_what_cannot_be_silenced(flags, match):
     with pytest.raises(UsageError, match=match):
         survive.opened(load_settings(flags=SETTINGS | flags), Screen(quiet=True), None, None)
+
+
+def test_loops_that_no_memory_holds_are_refused_before_any_is_drawn():
+    flags = SETTINGS | {"survival.loops": 10**8}
+    with pytest.raises(OutOfMemory, match="a loop of 100000000 devices over"):
+        survive.opened(load_settings(flags=flags), Screen(quiet=True), None, None)

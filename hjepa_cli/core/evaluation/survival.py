@@ -56,7 +56,10 @@ class Trial:
         return self.settle_steps + gap_steps + self.watch_steps
 
     def schedule(self, gap_steps: int, steps: int, devices: int) -> Bools:
-        """Return when packets arrive: bool [steps, devices], the same for all devices."""
+        """Return when packets are sent: bool [steps, devices], the same for all devices.
+
+        They arrive in the same step where the link is never late.
+        """
         k = np.arange(steps)
         last = self.settle_steps
         before = (k <= last) & ((last - k) % self.interval_steps == 0)
@@ -160,7 +163,11 @@ class Rare:
         def run(normal: Floats, rows: Integers) -> Floats:
             noise = normal * scale
             draws = Draws(
-                first.initial[rows], noise, np.zeros(noise.shape[:2]), first.mass_scale[rows]
+                first.initial[rows],
+                noise,
+                np.zeros(noise.shape[:2]),
+                first.mass_scale[rows],
+                link=first.link.part(rows),
             )
             peak = np.zeros(len(rows))
 
