@@ -199,9 +199,9 @@ def test_the_stage_ranks_prediction_over_holding(tmp_path, monkeypatch):
         path = tmp_path / "runs" / "survive" / "0001" / "result.json"
         whole = path.read_text()
         path.write_text(json.dumps(seals.sealed(json.loads(whole) | edit)))
-        with pytest.raises(DataError, match="result.json lacks what a survive run has"):
+        with pytest.raises(DataError, match=r"result\.json lacks what a survive run has"):
             report.run(Screen(quiet=True), [tmp_path / "runs"], out=tmp_path / "report.html")
-        with pytest.raises(DataError, match="result.json lacks what a survive run has"):
+        with pytest.raises(DataError, match=r"result\.json lacks what a survive run has"):
             survive.run(settings, Screen(quiet=True), out=path.parent)
         path.write_text(whole)
 
