@@ -2,7 +2,7 @@
 
     python benchmarks/nr_devices.py [--symbols 14,4] [--snr 10:30] [--plant desktop]
 
-The tolerated gap of each payload is taken from the zoo's curves, or searched as ``hjepa eval`` does;
+The tolerated gap of each payload comes from the zoo's curves or is searched as ``hjepa eval`` does;
 counts of the law ``duty`` follow for each physical layer. Prints Markdown tables: devices with
 95 % CI by payload and SNR, and what a packet takes.
 """
