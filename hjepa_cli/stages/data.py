@@ -15,8 +15,8 @@ from hjepa_cli.core.datasets.dataset import (
     find_newest_dataset,
     load_dataset,
 )
-from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.control_law import control_law, control_of
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError, require
 from hjepa_cli.output.screen import Screen

@@ -18,12 +18,11 @@ from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.workers import ModelFile
 from hjepa_cli.core.networks.model import Model
-from hjepa_cli.core.plants.control_law import control_of
-from hjepa_cli.core.plants.named import plant, plant_of
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS
-from hjepa_cli.stages.inputs import open_dataset
+from hjepa_cli.stages.inputs import brought_along, open_dataset
 from hjepa_cli.storage import runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 from hjepa_cli.storage.zoo import CURVES_FILE
@@ -193,9 +192,8 @@ def open_model_set(
 
 
 def under_law_of(model: Model, settings: Settings) -> Settings:
-    """Return settings with the law that a model learned, for all that is compared with it."""
-    control = control_of(model.metadata["settings"], model.digest)
-    return dataclasses.replace(settings, control=control)
+    """Return settings with the law that a model learned, and its pictures, for all beside it."""
+    return brought_along(settings, model.metadata["settings"], model.digest)
 
 
 def how_to_train(method: str, settings: Settings) -> str:
@@ -245,7 +243,7 @@ def _find(
         with contextlib.suppress(HjepaError, KeyError, TypeError):  # damaged ones hold nothing
             metadata = load_checkpoint(path).metadata
             if metadata["plant"] == settings.plant and seed in (None, metadata.get("seed")):
-                held = offered_methods(metadata["architecture"], plant(settings.plant))
+                held = offered_methods(metadata["architecture"], plant_of(settings))
         if taken := [name for name in missing if name in held]:
             found.append(path)
             screen.say(f"{', '.join(taken)}: model {path}")

@@ -14,7 +14,7 @@ from typing import Any
 from hjepa_cli.config.checks import check_cell
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
@@ -63,7 +63,7 @@ def run(
         DataError: a damaged checkpoint, or one of another plant.
         NumericalError: ``verify`` does not confirm what was found.
     """
-    radio, kind = settings.radio, plant(settings.plant)
+    radio, kind = settings.radio, plant_of(settings)
     grid_db = parse_snr(radio.snr_db)
     check_cell(radio, {"remeasure": remeasure})
     count = counting(settings, screen, checkpoint, dataset, further)

@@ -8,8 +8,8 @@ from typing import Any
 from hjepa_cli.config.checks import late
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
-from hjepa_cli.core.plants.frames import FRAME_BITS
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.frames import frame_bits
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.capacity import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
@@ -42,7 +42,7 @@ class ByFormula:
     ) -> None:
         self.models = open_measurable(settings, screen, checkpoint, dataset, further)
         self._law, self._settings, self._screen = law, settings, screen
-        self._cell = Cell.of(settings.radio, plant(settings.plant))
+        self._cell = Cell.of(settings.radio, plant_of(settings))
 
     def measured_methods(self, grid_db: Sequence[float]) -> dict[float, list[str]]:
         """Return by SNR the methods that can be measured, late where the law makes them so.
@@ -138,7 +138,7 @@ class ByFormula:
     def _in_time(self, method: str, snr_db: float) -> str:
         if METHODS[method].sends != "frames":
             return method
-        bits = int(method.rpartition("-")[2]) * FRAME_BITS
+        bits = int(method.rpartition("-")[2]) * frame_bits(self._settings.camera.frame_shape)
         delay_slots = self._law.asked("delay_slots", self._cell.link(bits, snr_db))
         return late(method, math.ceil(delay_slots * (1 - ROUNDING)))
 

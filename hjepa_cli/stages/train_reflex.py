@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.drivers import coder_of, methods_of
 from hjepa_cli.core.control.sensors import embedding_sensor
@@ -24,14 +24,15 @@ from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.networks.reflex import Reflex
 from hjepa_cli.core.plants.control_law import control_law
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.frames import WIDTH_PX
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.training import decay_fit, reflex_training
 from hjepa_cli.core.training.decay_fit import Law, Trial
 from hjepa_cli.core.training.optimiser import Optimiser, name_samples
 from hjepa_cli.core.training.reflex_training import Plans
 from hjepa_cli.core.training.rendered import RenderedSplit
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_reflex
 from hjepa_cli.stages import train_hierarchy
@@ -45,7 +46,13 @@ from hjepa_cli.stages.embedding_training import (
     save,
     views_of,
 )
-from hjepa_cli.stages.inputs import count_frames, embed, open_dataset
+from hjepa_cli.stages.inputs import (
+    brought_along,
+    check_same_plant,
+    count_frames,
+    embed,
+    open_dataset,
+)
 from hjepa_cli.stages.model_set import default_model
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
@@ -79,7 +86,9 @@ def run(
         DataError: model and dataset belong to different plants, or the model has no actor.
         NumericalError: training diverged.
     """
+    _refuse_recorded(settings)
     data = open_training_data(dataset, settings)
+    settings = brought_along(settings, data[0].settings, data[0].path)
     source = open_model(checkpoint, settings, screen)
     train, name = functools.partial(train_on, source), "train-reflex"
     return run_training(
@@ -99,6 +108,8 @@ def plan(
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
+    _refuse_recorded(settings)
+    settings = brought_along(settings, data.settings, data.path) if data else settings
     find = functools.partial(open_model, checkpoint, settings, Screen(quiet=True))
     _, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))
@@ -148,7 +159,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     train_networks(run, modules, z, starts, sides)
 
     law, trial, reflex = search_laws(settings, screen)
-    labels = labels_of_law(plant(settings.plant), law, starts, sides)
+    labels = labels_of_law(plant_of(settings), law, starts, sides)
     fit_actor_to(modules, "law", z, labels, architecture, settings)
     metadata = run.metadata(
         architecture, encoder=source.digest, health=source.metadata["health"], reflex=reflex
@@ -185,12 +196,7 @@ def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> C
             hint="hjepa train-hierarchy, or pass --checkpoint PATH",
         )
     checkpoint = load_checkpoint(path)
-    if checkpoint.metadata["plant"] != settings.plant:
-        raise DataError(
-            f"model {path} drives plant {checkpoint.metadata['plant']}, "
-            f"the dataset is of plant {settings.plant}",
-            hint=f"hjepa train-hierarchy --plant {settings.plant}",
-        )
+    check_same_plant(checkpoint.metadata, settings, f"model {path}")
     architecture = checkpoint.metadata.get("architecture")
     kind = architecture.get("kind") if isinstance(architecture, dict) else None
     if kind not in ("hierarchy", "flat", "reflex"):
@@ -199,6 +205,14 @@ def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> C
             hint="pass a --checkpoint of hjepa train-hierarchy",
         )
     return checkpoint
+
+
+def _refuse_recorded(settings: Settings) -> None:
+    if settings.plant == RECORDED:
+        raise UsageError(
+            "reflexes are trained on what the teacher does elsewhere; a recorded plant has none",
+            hint="hjepa eval --dataset DIR compares with hold, zero and ts-jepa",
+        )
 
 
 def describe_architecture(
@@ -253,10 +267,11 @@ def states_behind(train: RenderedSplit, settings: Settings, *, flip: bool) -> tu
 
     A mirrored picture has the forces of its unmirrored state, mirrored.
     """
-    kind, states = plant(settings.plant), train.states.numpy().astype(float)
+    kind, states = plant_of(settings), train.states.numpy().astype(float)
     starts, sides = [], []
     for mirrored, shifts_px in views_of(settings, len(states), flip=flip):
         shown_px = -shifts_px if mirrored else shifts_px
+        shown_px = shown_px * (WIDTH_PX / train.frames.shape[-2])  # in the camera's own pictures
         moved = kind.sideways(states, shown_px[:, None]) if shown_px.any() else states
         starts.append(moved.reshape(-1, states.shape[2]))
         side = np.array(kind.force_signs) if mirrored else np.ones(len(kind.force_signs))
@@ -268,7 +283,7 @@ def teacher_plans(
     network: Reflex, starts: Floats, sides: Floats, settings: Settings, explore: Generator | None
 ) -> Plans:
     """Return what the teacher does from each state on, for a network's longest age and a call."""
-    kind, steps = plant(settings.plant), network.longest_age + network.shape[0]
+    kind, steps = plant_of(settings), network.longest_age + network.shape[0]
     options, pushes_n = settings.collect, None
     if explore is not None:
         pushes_n = reflex_training.pushes(
@@ -291,7 +306,7 @@ def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[st
     options, protocol, seed = settings.reflex, settings.protocol, settings.seed
     searched = {"candidates": options.search_candidates, "rounds": options.search_rounds}
     screen.say("searching laws whose force fades, on the true state")
-    kind, devices = plant(settings.plant), options.search_devices
+    kind, devices = plant_of(settings), options.search_devices
     trial = Trial.make(kind, protocol, devices=devices, steps=options.search_steps, seed=seed)
     law, _ = decay_fit.search_law(trial, seed=seed, **searched)
     faded, gain = decay_fit.search_law(trial, seed=seed, tied=True, **searched)
@@ -337,6 +352,6 @@ def examine(
     """Return the held-out health of the actor of a law."""
     z = embed(modules["encoder"], test, settings).flatten(0, 1)
     states = test.states.numpy().astype(float).reshape(len(z), -1)
-    truth = labels_of_law(plant(settings.plant), law, states, np.ones((1, len(law.gains_n))))
+    truth = labels_of_law(plant_of(settings), law, states, np.ones((1, len(law.gains_n))))
     device = resolve_device(settings.device)
     return {"law_nrmse": health.nrmse(modules["law"].act(z.to(device)).cpu(), truth)}  # type: ignore[operator]

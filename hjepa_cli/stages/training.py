@@ -22,15 +22,14 @@ from hjepa_cli.compute.versions import versions
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.datasets.dataset import Dataset, Trajectories
 from hjepa_cli.core.networks.model import build_modules
-from hjepa_cli.core.plants.control_law import control_of
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.progress import Part, Progress
 from hjepa_cli.core.training.ranks import ALONE, Ranks
 from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.inputs import open_dataset, render
+from hjepa_cli.stages.inputs import brought_along, open_dataset, render
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint
 from hjepa_cli.storage.files import canonical_json
@@ -153,9 +152,7 @@ def run_training(
     """
     keep_freed_memory()
     dataset, recorded = data
-    # A dataset brings the law that its labels are of.
-    control = control_of(dataset.settings, dataset.path)
-    settings = dataclasses.replace(settings, control=control)
+    settings = brought_along(settings, dataset.settings, dataset.path)
     inputs = {"dataset": describe_input(dataset.path, dataset.digest)}
     inputs |= {name: describe_input(one.path, one.digest) for name, one in sources.items()}
     with ExitStack() as stack:
@@ -198,7 +195,7 @@ def plan_training(
 ) -> Plan:
     """Plan a training stage that leaves a run with a checkpoint of an architecture."""
     with torch.device("meta"):
-        tensors = untrained(architecture, settings.plant).state_dict().values()
+        tensors = untrained(architecture, settings).state_dict().values()
     return Plan(
         command=stage,
         reads=[*reads],
@@ -218,7 +215,7 @@ def check_stride(h: int, steps: int) -> None:
         )
 
 
-def untrained(architecture: Architecture, plant_name: str) -> nn.ModuleDict:
-    """Return new networks of an architecture for a plant, drawn from torch's generator."""
-    kind = plant(plant_name)
+def untrained(architecture: Architecture, settings: Settings) -> nn.ModuleDict:
+    """Return new networks of an architecture for the settings' plant, drawn by torch."""
+    kind = plant_of(settings)
     return build_modules(architecture, kind.action_shape, kind.force_signs)

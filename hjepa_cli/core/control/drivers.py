@@ -89,7 +89,7 @@ def embedding_driver(
     has no other controller for links that deliver at every step.
     """
     coder, hold = coder_of(settings, model), last_force(model)
-    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    camera = actual_camera(settings)
     sensor = embedding_sensor(model, coder.send, camera)
     drives = controller or hold
     reactive = hold if family == "embedding" else drives

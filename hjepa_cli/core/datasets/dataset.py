@@ -10,13 +10,15 @@ import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
-from hjepa_cli.core.plants.frames import FRAME_SHAPE
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.config.schema import RECORDED, CameraSettings
+from hjepa_cli.core.plants.named import camera_in, plant_in
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, NumericalError, UsageError
 from hjepa_cli.storage import files, seals
 from hjepa_cli.storage import tensors as arrays
@@ -36,10 +38,10 @@ class Trajectories:
 
     Args:
         states: float32 [N, T + 1, S], the plant's states; of a cart-pole x (m), x_dot (m/s), theta
-            (rad), theta_dot (rad/s).
+            (rad), theta_dot (rad/s). S = 0 where none were recorded.
         applied_n: float32 [N, T, *A], the force or forces applied at step k (N).
         teacher_n: float32 [N, T, *A], the teacher's for the state at step k (N).
-        frames: uint8 [N, T + 1, 64, 128, 3], or ``None`` if they are rendered on load.
+        frames: uint8 [N, T + 1, H, W, C], or ``None`` if they are rendered on load.
     """
 
     states: np.ndarray
@@ -81,6 +83,7 @@ class _SplitEntry(msgspec.Struct):
 
 class _Config(msgspec.Struct):
     collect: dict[str, Any] = {}
+    camera: CameraSettings = CameraSettings()
 
 
 class _Manifest(msgspec.Struct):
@@ -107,6 +110,21 @@ class Dataset:
     frames: str
     splits: dict[str, Any]
 
+    @property
+    def kind(self) -> System:
+        """Return the plant. Raises DataError where no plugin in force adds it."""
+        return _plant(self.plant, self.settings, self.path)
+
+    @property
+    def frame_shape(self) -> tuple[int, int, int]:
+        """Return (H, W, C) of its pictures."""
+        return camera_in(self.settings).frame_shape
+
+    @property
+    def rollouts(self) -> str:
+        """Name the split on which predicted forces are compared with the right ones."""
+        return "clean" if "clean" in self.splits else "test"
+
     def split(self, name: str) -> Trajectories:
         """Read one of ``train``, ``test``, ``clean``, verifying sha256, shapes and values.
 
@@ -126,7 +144,8 @@ class Dataset:
     def _read_shard(self, shard: Mapping[str, Any], steps: int) -> dict[str, np.ndarray]:
         path = self.path / shard["name"]
         stored = self.frames == "stored"
-        expected = _expected(shard["trajectories"], steps, stored, path, self.plant)
+        count, kind, frame_shape = shard["trajectories"], self.kind, self.frame_shape
+        expected = _expected(count, steps, stored, path, kind, frame_shape)
         values = (np.dtype(name).itemsize * math.prod(shape) for name, shape in expected.values())
         limit_bytes = sum(values) + arrays.HEADER_LIMIT_BYTES + 8
         data = files.read_bytes(path, limit=limit_bytes)
@@ -144,9 +163,15 @@ class Dataset:
 
 
 def write_shard(
-    directory: Path, shard: Shard, trajectories: Trajectories, plant_name: str
+    directory: Path,
+    shard: Shard,
+    trajectories: Trajectories,
+    plant_name: str,
+    settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Described:
     """Write one shard and return how the manifest will describe it.
+
+    ``settings`` are those that the manifest will have.
 
     Raises:
         DataError: wrong shapes or dtypes.
@@ -155,7 +180,8 @@ def write_shard(
     """
     stored, tensors = trajectories.frames is not None, trajectories.tensors()
     path = directory / shard.name
-    expected = _expected(len(trajectories), trajectories.steps, stored, path, plant_name)
+    kind, frame_shape = _plant(plant_name, settings, path), camera_in(settings).frame_shape
+    expected = _expected(len(trajectories), trajectories.steps, stored, path, kind, frame_shape)
     if reason := arrays.difference(tensors, expected):
         raise DataError(f"{path}: {reason}")
     if bad := arrays.non_finite(tensors):
@@ -237,7 +263,10 @@ def load_dataset(path: Path, plant_name: str | None = None) -> Dataset:
             hint=f"hjepa collect with a preset of plant {plant_name}",
         )
     fields = ("plant", "config", "camera", "sha256", "frames", "splits")
-    return Dataset(path, *(manifest[name] for name in fields))
+    data = Dataset(path, *(manifest[name] for name in fields))
+    if data.plant == RECORDED:
+        _ = data.kind  # described soundly
+    return data
 
 
 @contextlib.contextmanager
@@ -275,12 +304,22 @@ def per_shard(stored: bool) -> int:
     return SHARD_TRAJECTORIES_WITH_FRAMES if stored else SHARD_TRAJECTORIES
 
 
-def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str) -> arrays.Shapes:
-    """Return the tensors of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
+def _plant(name: str, settings: Mapping[str, Any], where: Path) -> System:
     try:
-        kind = plant(plant_name)
+        return plant_in(name, settings)
     except UsageError as error:
         raise DataError(f"{where}: {error.message}") from None
+
+
+def _expected(
+    count: int,
+    steps: int,
+    stored: bool,
+    where: Path,
+    kind: System,
+    frame_shape: tuple[int, int, int],
+) -> arrays.Shapes:
+    """Return the tensors of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
     if count < 1 or steps < 1:
         raise DataError(f"{where} holds {count} trajectories of {steps} steps; at least 1 of each")
     forces = (count, steps, *kind.action_shape)
@@ -290,5 +329,5 @@ def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str
         "teacher_n": ("float32", forces),
     }
     if stored:
-        expected["frames"] = ("uint8", (count, steps + 1, *FRAME_SHAPE))
+        expected["frames"] = ("uint8", (count, steps + 1, *frame_shape))
     return expected
