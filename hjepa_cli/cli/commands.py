@@ -18,7 +18,7 @@ from hjepa_cli.stages.stage import Imported
 
 PIPELINE, TOOLS = "Pipeline", "Tools"
 GROUPS = {
-    "data": "Describe, verify, look at and export datasets.",
+    "data": "Import, describe, verify, look at and export datasets.",
     "models": "List, describe and verify trained models.",
     "config": "Show settings.",
 }
@@ -214,6 +214,26 @@ COMMANDS = (
         Imported("hjepa_cli.stages.compare:run"),
         ("paths:evaluations", "methods:compare", "figures:compare", "formats"),
         panel=TOOLS,
+    ),
+    Command(
+        "data import",
+        "Make a dataset of recorded pictures and actions, of a plant that hjepa does not know.",
+        Imported("hjepa_cli.stages.import_data:run"),
+        (
+            *("source", "test", "clean", "kind:import", "size", "grey", "limit"),
+            *(
+                "fps:import",
+                "action_offset",
+                "steps:import",
+                "held_out",
+                "mirror_signs",
+                "actions",
+                "states",
+            ),
+            *("expert", "camera", "skip_bad", "out"),
+        ),
+        plan=Imported("hjepa_cli.stages.import_data:plan"),
+        product="dataset",
     ),
     Command(
         "data info",

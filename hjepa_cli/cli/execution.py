@@ -41,8 +41,10 @@ def execute(command: Command, given: Given) -> None:
             torchrun.refuse()
         if dry_run and command.plan is not None:
             plan = getattr(command.plan, "function", command.plan)
-            wanted = inspect.signature(plan).parameters.keys() & inputs.keys()
-            planned = plan(**{name: inputs[name] for name in wanted})
+            parameters = inspect.signature(plan).parameters
+            takes_all = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+            wanted = [name for name in inputs if name in parameters or takes_all]
+            planned = plan(**{name: inputs[name] for name in wanted if name != "screen"})
             if not isinstance(planned, Plan):
                 raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")
             planned.show(screen)

@@ -297,7 +297,7 @@ def describe(data: Dataset, seconds: float, frames_per_s: float | None) -> dict[
         "dataset": str(data.path),
         "trajectories": count,
         "test_trajectories": counts["test"],
-        "clean_trajectories": counts["clean"],
+        "clean_trajectories": counts.get("clean", 0),
         "steps": steps,
         "seconds": round(seconds, 3),
         "frames_per_s": None if frames_per_s is None else round(frames_per_s, 1),

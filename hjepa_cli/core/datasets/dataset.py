@@ -17,7 +17,11 @@ import msgspec
 import numpy as np
 
 from hjepa_cli.config.schema import RECORDED, CameraSettings
+from hjepa_cli.core.datasets.importing import arrays as arrays_of
+from hjepa_cli.core.datasets.importing.assembly import Assembly
+from hjepa_cli.core.datasets.importing.prepared import Options, Prepared, prepare
 from hjepa_cli.core.plants.named import camera_in, plant_in
+from hjepa_cli.core.plants.recorded import RecordedCamera
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, NumericalError, UsageError
 from hjepa_cli.storage import files, seals
@@ -110,6 +114,68 @@ class Dataset:
     frames: str
     splits: dict[str, Any]
 
+    @classmethod
+    def from_arrays(
+        cls,
+        frames: Sequence[np.ndarray] | np.ndarray,
+        actions: Sequence[np.ndarray] | np.ndarray,
+        states: Sequence[np.ndarray] | np.ndarray | None = None,
+        *,
+        expert_actions: Sequence[np.ndarray] | np.ndarray | None = None,
+        limits: Sequence[float] | None = None,
+        fps: float = 50.0,
+        size: tuple[int, int] = (64, 128),
+        grey: bool = False,
+        mirror_signs: Sequence[float] = (),
+        steps: int | None = None,
+        action_offset: int = 0,
+        held_out: float = 0.2,
+        out: str | Path | None = None,
+    ) -> "Dataset":
+        """Write a dataset of recorded arrays; see ``hjepa data import`` for what the rest means.
+
+        Args:
+            frames: [N, R, H, W, C], or a list with [R, H, W, C] of each episode, R its own.
+            actions: [N, R, A] or [N, R − 1, A], or a list; row j leads from frame j to frame j + 1.
+            states: [N, R, S], or a list, if anybody knows them.
+            expert_actions: what an expert would do at each frame; default: the actions.
+            limits: of the actions; default: the largest of each.
+            fps: frames a second.
+            size, grey: of the frames in the dataset.
+            mirror_signs: what a mirror does to each action, 1 or −1, where that is true at all.
+            steps: of a trajectory; default: of the shortest episode.
+            action_offset: row j + ``action_offset`` leads from frame j to frame j + 1.
+            held_out: share of the episodes for the split ``test``.
+            out: its directory; default: the next free ``data/recorded-<nnnn>``.
+
+        Raises:
+            UsageError: an argument that makes no sense, or ``out`` holds a dataset already.
+            DataError: an episode is unsound; the message says which row.
+        """
+        given = {"actions": actions, "states": states, "expert": expert_actions}
+        columns = {key: list(values) for key, values in given.items() if values is not None}
+        recording = arrays_of.recording(list(frames), columns, format="arrays")
+        if limits is None:
+            rows = np.concatenate([np.abs(rows).reshape(len(rows), -1) for rows in actions])
+            limits = np.where(rows.max(axis=0) > 0, rows.max(axis=0), 1.0).tolist()
+        camera = CameraSettings(*size, grey)
+        options = Options(
+            camera,
+            limits=tuple(limits),
+            step_s=1 / fps,
+            offset=action_offset,
+            steps=steps,
+            held_out=held_out,
+            mirror=tuple(mirror_signs),
+        )
+        prepared = prepare({"train": recording}, options)
+        with open_directory(None if out is None else Path(out), RECORDED) as directory:
+            if (directory / MANIFEST).exists():
+                raise UsageError(f"{directory} holds a dataset already; choose another out")
+            definition = definition_of(prepared, camera)
+            made = write_shards(directory, prepared.assembly, definition)
+            return write_recording(directory, list(made), definition)
+
     @property
     def kind(self) -> System:
         """Return the plant. Raises DataError where no plugin in force adds it."""
@@ -201,6 +267,61 @@ def write_shard(
         "stored": stored,
         "sha256": hashlib.sha256(data).hexdigest(),
     }
+
+
+def definition_of(prepared: Prepared, camera: CameraSettings) -> dict[str, Any]:
+    """Return the settings of an imported dataset: its plant, its pictures, how it was cut."""
+    made = prepared.assembly
+    return {
+        "seed": None,
+        "recorded": dataclasses.asdict(prepared.known),
+        "camera": dataclasses.asdict(camera),
+        "import": {
+            "format": prepared.format,
+            "episodes": prepared.episodes,
+            "steps": made.steps,
+            "lossy": prepared.lossy,
+        },
+    }
+
+
+def write_shards(
+    directory: Path,
+    made: Assembly,
+    settings: Mapping[str, Any],
+    done: Mapping[str, Described] = MappingProxyType({}),
+) -> Iterator[Described]:
+    """Write the shards of an assembly that are not ``done``; yield what describes each.
+
+    One without any sound trajectory has none, and no file.
+
+    Raises:
+        As :func:`write_shard` and :meth:`Assembly.trajectories`.
+    """
+    left = [shard for shard in made.shards() if shard.name not in done]
+    for shard, tensors in made.trajectories(left):
+        found = {"name": shard.name, "split": shard.split, "trajectories": 0}
+        if tensors:
+            found = write_shard(directory, shard, Trajectories(**tensors), RECORDED, settings)
+        yield found
+
+
+def write_recording(
+    directory: Path, shards: Sequence[Described], settings: Mapping[str, Any]
+) -> Dataset:
+    """Write the manifest of an imported dataset. Raises DataError where a split is empty."""
+    written = [shard for shard in shards if shard["trajectories"]]
+    for split in dict.fromkeys(shard["split"] for shard in shards):
+        if split not in {shard["split"] for shard in written}:
+            raise DataError(f"no trajectory of split {split} is left")
+    size = camera_in(settings)
+    return write_manifest(
+        directory,
+        settings=settings,
+        shards=written,
+        plant_name=RECORDED,
+        camera_manifest=RecordedCamera(size.frame_shape).manifest(),
+    )
 
 
 def write_manifest(
