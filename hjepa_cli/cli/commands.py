@@ -121,7 +121,8 @@ def _add_sources(settings: Settings, given: Given) -> None:
 SCALE = (
     *("radio.snr_db", "radio.law", "radio.schedulers", "radio.uncertainty", "radio.topology"),
     *("radio.bandwidth_hz", "radio.noise", "radio.power_margin_db", "radio.coherence_slots"),
-    *("radio.seeds", *MEASURED, "remeasure", "verify", "checkpoint", "dataset:clean", "out"),
+    *("radio.seeds", *MEASURED, "remeasure", "verify", "tolerance_steps", "checkpoint"),
+    *("dataset:clean", "out"),
 )
 
 

@@ -14,11 +14,14 @@ from hjepa_cli.cli.commands import Command, Given
 from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code, sigterm_raises
 from hjepa_cli.config.checks import resolve
-from hjepa_cli.config.schema import declared
+from hjepa_cli.config.schema import RECORDED, declared
 from hjepa_cli.config.settings import locate
 from hjepa_cli.errors import HjepaError, Interrupted, StorageError, Unsealed, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan
+from hjepa_cli.storage.peeking import any_of
+
+NAMING = ("dataset", "encoder", "checkpoint")  # inputs that say which plant they are of
 
 
 class PipeClosed(HjepaError):
@@ -66,6 +69,8 @@ def execute(command: Command, given: Given) -> None:
 
 def _settings(command: Command, given: Given) -> Given:
     """Return what was given with the settings in place of what they are made of."""
+    if given["plant"] is None and any_of(RECORDED, map(given.get, NAMING)):
+        given["plant"] = RECORDED  # an input says so
     preset, config, flags = _layers(given)
     settings = resolve(preset, config, flags)
     if command.check is not None:

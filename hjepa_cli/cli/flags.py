@@ -332,6 +332,13 @@ _LOOP = {
     "live": _switch("--live", "Play in this terminal; write nothing."),
 }
 _RADIO = {
+    "tolerance_steps": Input(
+        Annotated[float, Meta(ge=1, le=LARGEST)],
+        "--tolerance-steps",
+        "Count devices whose packets may come so many control steps apart, and measure nothing: "
+        "where no closed loop exists.",
+        "STEPS",
+    ),
     "snr_db": Input(
         Annotated[float, Meta(ge=-100, le=100)],
         "--snr",

@@ -112,11 +112,9 @@ def preview(
         frames = frames_of(data_camera(data), recorded.states[:, steps + 1])
     else:
         frames = recorded.frames[:, steps + 1]
+    kind, driven_n = data.kind, recorded.applied_n
     captions = [
-        [
-            f"{split} {row}, k {step}, {forces(recorded.applied_n[row, step], data.kind)}"
-            for step in steps
-        ]
+        [f"{split} {row}, k {step}, {forces(driven_n[row, step], kind)}" for step in steps]
         for row in range(len(recorded))
     ]
     target = files.target(out or Path(f"{data.path.name}-{split}.png"))

@@ -127,18 +127,21 @@ def write(
     """Write all shards that the log does not have, and the manifest."""
     made = prepared.assembly
     shards = made.shards()
-    counts = {shard.name: shard.stop - shard.start for shard in shards}
-    done = sum(counts[name] for name in log.done if name in counts)
-    frames = made.steps + 1
+    frames = {
+        shard.name: sum(
+            piece.steps + 1 for piece in made.splits[shard.split][shard.start : shard.stop]
+        )
+        for shard in shards
+    }
+    done = sum(frames[name] for name in log.done if name in frames)
     for described in log.done.values():
         made.bad += described.get("bad", [])
         made.said |= set(described.get("said", []))
-    total = sum(counts.values())
-    with screen.progress("import", total * frames, "frames", done=done * frames) as bar:
+    with screen.progress("import", made.frames(), "frames", done=done) as bar:
         for described in write_shards(directory, made, definition, log.done):
             said = {"bad": list(made.bad), "said": sorted(made.said)}
             log.add({**described, **said})
-            bar.advance(counts[described["name"]] * frames)
+            bar.advance(frames[described["name"]])
     data = write_recording(directory, [log.done[shard.name] for shard in shards], definition)
     remove_log(directory)
     return data
@@ -272,28 +275,27 @@ def plan_task(task: Task, out: Path | None) -> Plan:
     prepared = prepare(task.recordings(), task.options)
     made = prepared.assembly
     count = sum(map(len, made.splits.values()))
-    frames = count * (made.steps + 1)
+    steps = {split: pieces[0].steps for split, pieces in made.splits.items()}
     height, width, channels = made.frame_shape
     return Plan(
         command="data import",
         reads=[f"{split}: {path}" for split, path in task.sources.items()],
         work=[
-            f"cut {prepared.episodes} episodes into {count} trajectories of {made.steps} steps, "
-            f"{len(prepared.known.limits)} actions, {len(prepared.known.states)} states",
-            f"convert {frames} frames to {height} x {width} x {channels}",
+            f"cut {prepared.episodes} episodes into {count} trajectories of {steps['train']} "
+            f"steps, {len(prepared.known.limits)} actions, {len(prepared.known.states)} states",
+            f"convert {made.frames()} frames to {height} x {width} x {channels}",
             *(f"leave out {flaw}" for flaw in made.bad),
         ],
         writes=[f"dataset {out or 'data/recorded-<next number>'} in {len(made.shards())} shards"],
         writes_bytes=size_bytes(prepared),
-        seconds=2 + frames / IMPORTED_FRAMES_PER_S,
+        seconds=2 + made.frames() / IMPORTED_FRAMES_PER_S,
     )
 
 
 def size_bytes(prepared: Prepared) -> int:
     """Return what the frames of a dataset take on disk."""
     made = prepared.assembly
-    count = sum(map(len, made.splits.values())) * (made.steps + 1)
-    return count * frame_bits(made.frame_shape) // 8
+    return made.frames() * frame_bits(made.frame_shape) // 8
 
 
 def tell_alignment(verdict: alignment.Verdict | None, offset: int, screen: Screen) -> None:
@@ -319,12 +321,12 @@ def describe(
 ) -> Result:
     """Return the document of ``--json``."""
     made = prepared.assembly
-    frames = sum(of["trajectories"] for of in data.splits.values()) * (made.steps + 1)
+    frames = sum(of["trajectories"] * (of["steps"] + 1) for of in data.splits.values())
     return {
         "dataset": str(data.path),
         "plant": data.plant,
         "episodes": prepared.episodes,
-        "steps": made.steps,
+        "steps": data.splits["train"]["steps"],
         **{f"{name}_trajectories": of["trajectories"] for name, of in data.splits.items()},
         "frames": frames,
         "frame_shape": list(made.frame_shape),

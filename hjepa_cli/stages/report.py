@@ -163,6 +163,8 @@ def inputs_of(environment: Mapping[str, Any]) -> list[str]:
             path = Path(given["path"])
             here = path.is_relative_to(Path.cwd())
             flags += [f"--{name}", str(path.relative_to(Path.cwd()) if here else path)]
+        elif isinstance(given, float):
+            flags += [f"--{name.replace('_', '-')}", f"{given:g}"]
     return flags
 
 

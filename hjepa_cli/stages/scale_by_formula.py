@@ -100,9 +100,7 @@ class ByFormula:
             for row in reversed(rows)
         }
         screen.table(
-            f"one {result['plant']} loop at score {result['acceptable_score']:g}: seed "
-            f"{result['seed']}, {result['n_devices']} devices, {described_steps(result)}, 95 % CI; "
-            f"limit λ/ln 2 = {result['limit_bits_per_s']:.1f} bit/s",
+            self.loop_title(result),
             ["method", axis.label, "bits", "bit/s", "÷limit"],
             [
                 [
@@ -134,6 +132,14 @@ class ByFormula:
             if row["reason"]:
                 screen.say(f"{method} at {row['snr_db']:g} dB: {row['reason']}")
         screen.say(result["source"])
+
+    def loop_title(self, result: Mapping[str, Any]) -> str:
+        """Return the title of the table of what a loop needs."""
+        return (
+            f"one {result['plant']} loop at score {result['acceptable_score']:g}: seed "
+            f"{result['seed']}, {result['n_devices']} devices, {described_steps(result)}, 95 % CI; "
+            f"limit λ/ln 2 = {result['limit_bits_per_s']:.1f} bit/s"
+        )
 
     def _in_time(self, method: str, snr_db: float) -> str:
         if METHODS[method].sends != "frames":

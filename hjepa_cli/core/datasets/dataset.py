@@ -271,7 +271,6 @@ def write_shard(
 
 def definition_of(prepared: Prepared, camera: CameraSettings) -> dict[str, Any]:
     """Return the settings of an imported dataset: its plant, its pictures, how it was cut."""
-    made = prepared.assembly
     return {
         "seed": None,
         "recorded": dataclasses.asdict(prepared.known),
@@ -279,7 +278,6 @@ def definition_of(prepared: Prepared, camera: CameraSettings) -> dict[str, Any]:
         "import": {
             "format": prepared.format,
             "episodes": prepared.episodes,
-            "steps": made.steps,
             "lossy": prepared.lossy,
         },
     }

@@ -61,6 +61,11 @@ class Recorded(System):
         """Return no unit for each state: recordings do not say any."""
         return ("",) * len(self.state_names)
 
+    @property
+    def unstable_rate_rad_s(self) -> float:
+        """Return 0, which bounds no rate: nobody knows."""
+        return 0.0
+
     def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> Simulation:
         """Refuse."""
         _refuse("be simulated")

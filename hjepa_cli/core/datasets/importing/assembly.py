@@ -1,6 +1,7 @@
 """Episodes are cut into trajectories of one length, and held out whole."""
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
@@ -20,10 +21,16 @@ UNREADABLE = (OSError, ValueError, KeyError)  # of libraries that read pictures
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Piece:
-    """A trajectory begins at row ``start`` of an episode."""
+    """A trajectory of ``steps`` steps begins at row ``start`` of an episode."""
 
     of: Aligned
     start: int
+    steps: int
+
+    @property
+    def rows(self) -> slice:
+        """Return its rows; the first one is before k = 0."""
+        return slice(self.start, self.start + self.steps + 1)
 
 
 @dataclasses.dataclass(eq=False)
@@ -32,7 +39,6 @@ class Assembly:
 
     Attributes:
         splits: pieces by split, in the order of their episodes.
-        steps: T, of each trajectory.
         frame_shape: (H, W, C) of its frames.
         action_shape: A.
         skip_bad: leave out what cannot be read, and go on.
@@ -41,7 +47,6 @@ class Assembly:
     """
 
     splits: Mapping[str, Sequence[Piece]]
-    steps: int
     frame_shape: tuple[int, int, int]
     action_shape: tuple[int, ...]
     skip_bad: bool = False
@@ -50,9 +55,13 @@ class Assembly:
 
     def shards(self) -> list[Shard]:
         """Return the files that the trajectories make, if none is bad."""
-        frame_bytes = int(np.prod(self.frame_shape)) * (self.steps + 1)
+        longest = max(pieces[0].steps for pieces in self.splits.values()) + 1
         sizes = {split: len(pieces) for split, pieces in self.splits.items()}
-        return cut(sizes, max(SHARD_BYTES // frame_bytes, 1))
+        return cut(sizes, max(SHARD_BYTES // (math.prod(self.frame_shape) * longest), 1))
+
+    def frames(self) -> int:
+        """Return how many frames all trajectories have."""
+        return sum(piece.steps + 1 for pieces in self.splits.values() for piece in pieces)
 
     def trajectories(self, shards: Sequence[Shard]) -> Iterator[tuple[Shard, dict[str, Any]]]:
         """Yield the arrays of each shard, without those that are bad; an episode is read once.
@@ -74,7 +83,7 @@ class Assembly:
         """Yield the arrays of each piece; ``None`` where it is bad."""
         for _, group in groupby(pieces, key=lambda piece: id(piece.of)):
             some = list(group)
-            made = frames_of_pieces(some, self.steps, self.frame_shape, self.said)
+            made = frames_of_pieces(some, self.frame_shape, self.said)
             for number, piece in enumerate(some):
                 try:
                     frames = next(made)
@@ -87,9 +96,8 @@ class Assembly:
                 yield self._arrays(piece, frames)
 
     def _arrays(self, piece: Piece, frames: Pixels) -> dict[str, Any]:
-        """Return tensors as a dataset has them: the first row is the one before k = 0."""
-        rows = slice(piece.start, piece.start + self.steps + 1)
-        forces = (self.steps, *self.action_shape)
+        """Return tensors as a dataset has them."""
+        rows, forces = piece.rows, (piece.steps, *self.action_shape)
         return {
             "states": piece.of.states[rows].astype(np.float32),
             "applied_n": piece.of.actions[rows][1:].astype(np.float32).reshape(forces),
@@ -99,7 +107,7 @@ class Assembly:
 
 
 def frames_of_pieces(
-    pieces: Sequence[Piece], steps: int, frame_shape: tuple[int, int, int], said: set[str]
+    pieces: Sequence[Piece], frame_shape: tuple[int, int, int], said: set[str]
 ) -> Iterator[Pixels]:
     """Yield the frames uint8 [steps + 1, H, W, C] of ascending pieces of one episode.
 
@@ -117,7 +125,7 @@ def frames_of_pieces(
             blocks = episode.stream(start)
         held, at = held[start - at :], start
         read, rows = [held], len(held)
-        while rows < steps + 1:
+        while rows < piece.steps + 1:
             row = at + rows
             try:
                 block = next(blocks)
@@ -139,7 +147,7 @@ def frames_of_pieces(
             read.append(fitted(pixels, frame_shape))
             rows += len(read[-1])
         held = np.concatenate(read)
-        yield held[: steps + 1].copy()
+        yield held[: piece.steps + 1].copy()
 
 
 def shared_steps(episodes: Sequence[Aligned], steps: int | None) -> int:
@@ -168,7 +176,7 @@ def pieces_of(episodes: Sequence[Aligned], steps: int) -> list[Piece]:
     for one in episodes:
         last = one.rows - 1 - steps
         starts = sorted({*range(0, last + 1, steps), *([last] if last >= 0 else [])})
-        found += [Piece(one, start) for start in starts]
+        found += [Piece(one, start, steps) for start in starts]
     return found
 
 

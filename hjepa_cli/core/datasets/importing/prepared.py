@@ -57,19 +57,18 @@ class Prepared:
             DataError: a picture cannot be read.
         """
         made, pieces = self.assembly, list(self.assembly.splits["train"])
-        few = max(TESTED_ROWS // (made.steps + 1), 1)
+        few = max(TESTED_ROWS // (pieces[0].steps + 1), 1)
         chosen = pieces[:: max(-(-len(pieces) // few), 1)]
         frames, actions = [], []
         for piece in chosen:
             try:
-                seen = assembly.frames_of_pieces([piece], made.steps, made.frame_shape, set())
+                seen = assembly.frames_of_pieces([piece], made.frame_shape, set())
                 frames.append(next(seen))
             except DataError:
                 if not made.skip_bad:
                     raise
                 continue
-            rows = slice(piece.start, piece.start + made.steps + 1)
-            actions.append(piece.of.actions[rows])
+            actions.append(piece.of.actions[piece.rows])
         return alignment.judge(frames, actions) if frames else None
 
 
@@ -106,21 +105,22 @@ def prepare(recordings: Mapping[str, Recording], options: Options) -> Prepared:
     if "test" not in sound:
         train_on, test_on = assembly.held_out(sound["train"], options.held_out)
         sound = {"train": train_on, "test": test_on, **{k: sound[k] for k in sound if k != "train"}}
-    everything = [one for some in sound.values() for one in some]
-    steps = assembly.shared_steps(everything, options.steps)
+    cut_alike = ("train", "test") if "test" not in recordings else ("train",)
+    alike = [one for split in cut_alike for one in sound[split]]
+    splits = {}
     for split, some in sound.items():
+        steps = assembly.shared_steps(alike if split in cut_alike else some, options.steps)
         for one in some:
             if one.rows <= steps:
                 short = f"{one.episode.name}: {one.rows - 1} steps; trajectories have {steps}"
                 if not options.skip_bad:
                     raise DataError(short, hint=f"--steps {one.rows - 1}, or --skip-bad")
                 bad.append(short)
-        if not assembly.pieces_of(some, steps):
+        splits[split] = assembly.pieces_of(some, steps)
+        if not splits[split]:
             raise DataError(f"no episode of split {split} is left")
-    splits = {split: assembly.pieces_of(some, steps) for split, some in sound.items()}
-    made = Assembly(
-        splits, steps, options.camera.frame_shape, kind.action_shape, options.skip_bad, bad=bad
-    )
+    shapes = options.camera.frame_shape, kind.action_shape
+    made = Assembly(splits, *shapes, options.skip_bad, bad=bad)
     lossy = any(one.lossy for one in recordings.values())
     return Prepared(made, known, episodes, train.format, lossy)
 
