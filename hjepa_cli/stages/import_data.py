@@ -60,12 +60,15 @@ class Task:
     camera: str | None
     options: Options
 
-    def recordings(self) -> dict[str, Recording]:
-        """Open all sources."""
-        return {
-            split: open_recording(Path(path), self.format, self.chosen, self.camera)
-            for split, path in self.sources.items()
-        }
+    @contextlib.contextmanager
+    def recordings(self) -> Iterator[dict[str, Recording]]:
+        """Open all sources, and close them in the end."""
+        with contextlib.ExitStack() as stack:
+            found = {}
+            for split, path in self.sources.items():
+                found[split] = open_recording(Path(path), self.format, self.chosen, self.camera)
+                stack.callback(found[split].close)
+            yield found
 
 
 def run(screen: Screen, *, out: Path | None = None, **asked: Any) -> Result:
@@ -94,8 +97,16 @@ def import_task(screen: Screen, task: Task, out: Path | None) -> Result:
         raise UsageError(
             f"{out} holds a finished dataset", hint="choose a new or empty directory with --out DIR"
         )
+    with task.recordings() as recordings:
+        return import_recordings(screen, recordings, task, out)
+
+
+def import_recordings(
+    screen: Screen, recordings: Mapping[str, Recording], task: Task, out: Path | None
+) -> Result:
+    """Import what was opened."""
     started = time.perf_counter()
-    prepared = prepare(task.recordings(), task.options)
+    prepared = prepare(recordings, task.options)
     verdict = prepared.judge()
     tell_alignment(verdict, task.options.offset, screen)
     if prepared.lossy:
@@ -272,7 +283,8 @@ def to_plain(task: Task) -> dict[str, Any]:
 
 def plan_task(task: Task, out: Path | None) -> Plan:
     """Plan a task."""
-    prepared = prepare(task.recordings(), task.options)
+    with task.recordings() as recordings:
+        prepared = prepare(recordings, task.options)
     made = prepared.assembly
     count = sum(map(len, made.splits.values()))
     steps = {split: pieces[0].steps for split, pieces in made.splits.items()}

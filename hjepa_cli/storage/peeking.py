@@ -5,8 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from hjepa_cli.errors import HjepaError
-from hjepa_cli.storage import files, zoo
-from hjepa_cli.storage.tensors import HEADER_LIMIT_BYTES, METADATA_KEY
+from hjepa_cli.storage import files
 
 MANIFEST = "dataset.json"
 
@@ -17,6 +16,10 @@ def plant_in(named: str | Path) -> str | None:
     with contextlib.suppress(HjepaError, OSError, ValueError, LookupError, TypeError):
         if (path / MANIFEST).is_file():
             return str(files.read_json(path / MANIFEST)["plant"])
+        # numpy comes with these: the command line waits for it only where there is a checkpoint.
+        from hjepa_cli.storage import zoo
+        from hjepa_cli.storage.tensors import HEADER_LIMIT_BYTES, METADATA_KEY
+
         with open(zoo.resolve_model(named), "rb") as file:
             length = int.from_bytes(file.read(8), "little")
             header = files.parse_json(file.read(min(length, HEADER_LIMIT_BYTES)))

@@ -51,6 +51,7 @@ class Recording:
         limits: of each action; ``None`` where the source does not say.
         state_names: of the states, if there are any.
         lossy: whether its pictures were compressed with losses.
+        close: closes what its pictures are read from.
     """
 
     format: str
@@ -59,6 +60,7 @@ class Recording:
     limits: tuple[float, ...] | None = None
     state_names: tuple[str, ...] = ()
     lossy: bool = False
+    close: Callable[[], object] = lambda: None
 
 
 def table(values: Any, name: str, what: str) -> Floats:

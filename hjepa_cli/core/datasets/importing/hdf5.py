@@ -46,7 +46,7 @@ def read(path: Path) -> Recording:
             )
         lengths = file["ep_len"][:].astype(int).ravel().tolist()
         columns = {key: arrays.parts(column, lengths, key) for key, column in found.items()}
-        about: dict[str, Any] = {"format": "hdf5"}
+        about: dict[str, Any] = {"format": "hdf5", "close": file.close}
         if ABOUT in file.attrs:
             try:
                 about |= exported(json.loads(file.attrs[ABOUT]))
@@ -69,7 +69,7 @@ def read_minari(directory: Path) -> Recording:
             raise DataError(f"{directory} holds no episodes")
         pictures = [_pictures(group["observations"], directory) for group in groups]
         columns = {"actions": [group["actions"] for group in groups]}
-        about: dict[str, Any] = {"format": "minari", **_space(directory)}
+        about: dict[str, Any] = {"format": "minari", "close": file.close, **_space(directory)}
         return arrays.recording(pictures, columns, **about)
 
 
@@ -112,4 +112,8 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         yield file
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+        file.close()
         raise DataError(f"{path} has another layout: {error}") from None
+    except BaseException:
+        file.close()
+        raise

@@ -6,7 +6,7 @@ import re
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ class Member:
         DataError: it is no array of numbers.
     """
 
-    def __init__(self, archive: zipfile.ZipFile, name: str, *, flat: bool = False) -> None:
+    def __init__(self, archive: "_Archive", name: str, *, flat: bool = False) -> None:
         self._archive, self._name, self._at = archive, name, 0
         self.whole = self._open()
         self.shape = self.whole
@@ -68,7 +68,7 @@ class Member:
     def _open(self) -> tuple[int, ...]:
         """Go to the first row, and return the shape."""
         try:
-            self._stream = self._archive.open(f"{self._name}.npy")
+            self._stream = self._archive.stream(self._name)
             version = np.lib.format.read_magic(self._stream)
             newer = version == (2, 0)
             read = np.lib.format.read_array_header_2_0 if newer else _read_first_header
@@ -106,11 +106,40 @@ def read(path: Path) -> Recording:
         DataError: it is none, or an array is missing.
     """
     try:
-        archive = zipfile.ZipFile(path)
+        archive = _Archive(path)
     except (zipfile.BadZipFile, OSError) as error:
         raise DataError(f"{path} is no NPZ file: {error}") from None
+    try:
+        return _read(path, archive)
+    except BaseException:
+        archive.close()
+        raise
+
+
+class _Archive(zipfile.ZipFile):
+    """It closes with it what was opened in it."""
+
+    def __init__(self, path: Path) -> None:
+        self._streams: dict[str, IO[bytes]] = {}
+        super().__init__(path)
+
+    def stream(self, name: str) -> IO[bytes]:
+        """Open a member from its beginning, in place of what was opened of it before."""
+        if name in self._streams:
+            self._streams[name].close()
+        self._streams[name] = self.open(f"{name}.npy")
+        return self._streams[name]
+
+    def close(self) -> None:
+        """Close all of it."""
+        for stream in self._streams.values():
+            stream.close()
+        super().close()
+
+
+def _read(path: Path, archive: _Archive) -> Recording:
     names = [name.removesuffix(".npy") for name in archive.namelist()]
-    about = {"format": "npz", **_described(archive, names)}
+    about = {"format": "npz", "close": archive.close, **_described(archive, names)}
 
     def found(suffix: str = "") -> dict[str, str]:
         """Return the members of our columns that there are."""
@@ -156,7 +185,7 @@ def read(path: Path) -> Recording:
     )
 
 
-def _described(archive: zipfile.ZipFile, names: list[str]) -> dict[str, Any]:
+def _described(archive: _Archive, names: list[str]) -> dict[str, Any]:
     if ABOUT not in names:
         return {}
     try:
