@@ -109,11 +109,6 @@ def import_recordings(
     prepared = prepare(recordings, task.options)
     verdict = prepared.judge()
     tell_alignment(verdict, task.options.offset, screen)
-    if prepared.lossy:
-        screen.say(
-            "warning: the pictures were compressed with losses, which breaks motion of less than a "
-            "pixel: velocities are seen worse; record losslessly where you can"
-        )
     definition = definition_of(prepared, task.options.camera)
     existed = out is not None and out.exists()
     with open_directory(out, RECORDED) as directory:
@@ -124,6 +119,12 @@ def import_recordings(
         with telling_how_to_go_on(directory), undone(directory, keep=existed):
             data = write(directory, prepared, definition, ShardLog(directory, begun), screen)
     result = describe(data, prepared, verdict, time.perf_counter() - started)
+    if prepared.lossy:
+        screen.say(
+            "warning: the pictures were compressed with losses, which breaks motion of less than a "
+            "pixel: velocities are seen worse; record losslessly where you can"
+        )
+    tell_alignment(verdict, task.options.offset, screen)
     tell(result, screen)
     return result
 
@@ -325,7 +326,9 @@ def tell_alignment(verdict: alignment.Verdict | None, offset: int, screen: Scree
     elif best < LEAST_R2:
         screen.say(f"pictures hardly show any action (R² {best:.2f}): alignment is untested")
     else:
-        screen.say(f"alignment: offset {offset} fits the pictures (R² {stated:.2f})")
+        screen.say(
+            f"alignment: no offset fits the pictures clearly better than {offset} (R² {stated:.2f})"
+        )
 
 
 def describe(

@@ -162,7 +162,7 @@ def test_inverse_dynamics_find_actions_that_are_logged_late(shell, tmp_path):
     assert "--action-offset 1" in outcome.err
     outcome = shell("data", "import", "r.npz", *SAID, "--action-offset", 1, "--out", "e", "--json")
     found = outcome.document["alignment"]
-    assert found["best"] == 0 and "offset 1 fits" in outcome.err
+    assert found["best"] == 0 and "better than 1" in outcome.err
 
 
 def test_pictures_of_other_kinds_are_converted_and_that_is_said(shell, tmp_path):
@@ -191,12 +191,12 @@ def test_area_means_are_those_of_a_finer_grid():
     picture = random.integers(0, 256, (1, 12, 20, 3), dtype=np.uint8)
     fine = picture.repeat(7, 1).repeat(9, 2).astype(float)  # 84 × 180: divided by 7 × 9 and others
     for height, width in ((4, 5), (7, 9), (12, 20), (21, 36)):
-        if 84 % height or 180 % width:
+        if 84 % height or 180 % width:  # no whole parts of the finer grid
             continue
         wanted = fine.reshape(1, height, 84 // height, width, 180 // width, 3).mean((2, 4))
         found = area_means(area_means(picture, 1, height), 2, width)
         assert np.allclose(found, wanted, atol=1e-3)
-        assert np.array_equal(fitted(picture, (height, width, 3)), np.rint(wanted).astype(np.uint8))
+        assert np.abs(fitted(picture, (height, width, 3)) - wanted).max() < 0.501
 
 
 def broken(name, frames, actions):
@@ -296,7 +296,6 @@ def test_npz_never_unpickles_and_says_what_is_missing(shell, tmp_path):
         "no actions": {"frames": frames},
         "no frames": {"actions": actions},
         "[N, T + 1, H, W, C]": {"frames": frames[0, :, :, 0], "actions": actions},
-        "ep_len": {"frames": frames[0], "actions": actions[0]},
         "has no actions_1": {"frames_0": frames[0], "frames_1": frames[1], "actions_0": actions[0]},
     }
     for words, arrays in cases.items():
