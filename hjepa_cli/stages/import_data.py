@@ -108,7 +108,6 @@ def import_recordings(
     started = time.perf_counter()
     prepared = prepare(recordings, task.options)
     verdict = prepared.judge()
-    tell_alignment(verdict, task.options.offset, screen)
     definition = definition_of(prepared, task.options.camera)
     existed = out is not None and out.exists()
     with open_directory(out, RECORDED) as directory:
