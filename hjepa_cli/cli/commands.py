@@ -26,7 +26,9 @@ GROUPS = {
 RESOLVED = ("preset", "config", "plant", "seed")  # what takes these is given settings
 COMPUTED = (*RESOLVED, "device")
 PARALLEL = ("workers", "cluster")
-SHARED = ("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify")  # by stages
+SHARED = (
+    *("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify", "tolerance_steps"),
+)  # by stages
 LOOP = ("methods", "protocol")
 LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss")
 MEASURED = (

@@ -77,9 +77,11 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
     kind = plant_of(settings)
     path = path or find_newest_dataset(Path("data"), settings.plant)
     if path is None:
+        made_by = f"hjepa collect --plant {settings.plant}"
         raise MissingInputError(
             f"no dataset of plant {settings.plant} below data/",
-            hint=f"hjepa collect --plant {settings.plant}, or pass --dataset DIR",
+            hint=f"{'hjepa data import SOURCE' if settings.plant == RECORDED else made_by}, "
+            "or pass --dataset DIR",
         )
     data = load_dataset(path, settings.plant)
     if not same_camera(data.camera, camera_of(kind, camera_in(data.settings))):

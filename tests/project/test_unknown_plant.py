@@ -1,4 +1,4 @@
-"""A plant that hjepa does not know: MuJoCo moves and shows a puck on a table, which two forces push.
+"""A plant that hjepa does not know: MuJoCo moves and shows a puck that two forces push around.
 
 Nothing but pictures and actions goes through import, both trainings and offline evaluation; there
 are no states, and pictures have another size.

@@ -190,7 +190,7 @@ def _described(archive: _Archive, names: list[str]) -> dict[str, Any]:
         return {}
     try:
         with archive.open(f"{ABOUT}.npy") as file:
-            said = np.lib.format.read_array(file, allow_pickle=False)
+            said = np.lib.format.read_array(file)
         return exported(json.loads(str(said)))
     except (*BROKEN, TypeError):
         return {}
