@@ -5,6 +5,8 @@ optional hint (the command to run next); it never shows a traceback. Codes follo
 """
 
 import difflib
+import os
+import shlex
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 
@@ -39,6 +41,10 @@ class UsageError(HjepaError):
             self.args, self.key = (self.message,), None
 
 
+class ArrayError(UsageError, ValueError):
+    """An array from outside has another shape, type or range than a function takes."""
+
+
 class DataError(HjepaError):
     """A file does not hold what it should (foreign, truncated, tampered, other plant)."""
 
@@ -49,6 +55,20 @@ class MissingInputError(HjepaError):
     """A dataset, checkpoint or model is not there."""
 
     exit_code = 66
+
+
+def shell(words: Iterable[object]) -> str:
+    """Return a command as a shell takes it back, in one line and whatever bytes are in a path."""
+    return " ".join(map(_quoted, map(str, words)))
+
+
+def _quoted(word: str) -> str:
+    if word.isprintable():
+        return shlex.quote(word)
+    plain = (
+        chr(b) if 32 <= b < 127 and b not in b"'\\" else f"\\x{b:02x}" for b in os.fsencode(word)
+    )
+    return f"$'{''.join(plain)}'"
 
 
 def meant(name: object, names: Iterable[str]) -> str:
@@ -76,6 +96,12 @@ class NumericalError(HjepaError):
     exit_code = 70
 
 
+class OutOfMemory(HjepaError):
+    """What was asked for does not fit into memory."""
+
+    exit_code = 70
+
+
 class StorageError(HjepaError):
     """The disk refused: not writable, full, I/O error."""
 
@@ -96,6 +122,10 @@ class LockedError(HjepaError):
 
 class Unsealed(UserWarning):
     """A file of an older version has no seal: nobody can tell whether it was changed."""
+
+
+class Unlocked(UserWarning):
+    """A file system has no locks: nobody can tell whether another process works in a directory."""
 
 
 class Interrupted(HjepaError):

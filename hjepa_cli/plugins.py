@@ -52,10 +52,12 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "scheduled": "hjepa_cli.core.radio.laws.scheduled:SCHEDULED",
     },
     "stage": {
+        "tune-law": "hjepa_cli.stages.pipeline:TUNE_LAW",
         "collect": "hjepa_cli.stages.pipeline:COLLECT",
         "train-encoder": "hjepa_cli.stages.pipeline:TRAIN_ENCODER",
         "train-hierarchy": "hjepa_cli.stages.pipeline:TRAIN_HIERARCHY",
         "train-reflex": "hjepa_cli.stages.pipeline:TRAIN_REFLEX",
+        "train-fusion": "hjepa_cli.stages.pipeline:TRAIN_FUSION",
         "eval": "hjepa_cli.stages.pipeline:EVAL",
         "scale": "hjepa_cli.stages.pipeline:SCALE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
@@ -68,6 +70,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "method": {
         "hjepa": f"{_CONTROL}.methods.predictors:HJEPA",
+        "hjepa-fused": f"{_CONTROL}.methods.predictors:HJEPA_FUSED",
         **{f"ts-jepa-{h}": f"{_CONTROL}.methods.predictors:TS_JEPA" for h in range(1, 6)},
         "supervised-2": f"{_CONTROL}.methods.raw_frames:SUPERVISED_2",
         "supervised-4": f"{_CONTROL}.methods.raw_frames:SUPERVISED_4",
@@ -292,7 +295,7 @@ def read_regular(path: Path) -> str:
         raise ValueError("not a regular file")
     if path.stat().st_size > LIMIT_BYTES:
         raise ValueError(f"larger than {LIMIT_BYTES} bytes")
-    return path.read_text(encoding="utf-8")
+    return path.read_text(encoding="utf-8-sig")  # editors of some systems begin with a mark
 
 
 def ensure(sources: Iterable[Source]) -> None:

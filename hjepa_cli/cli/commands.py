@@ -153,6 +153,7 @@ COMMANDS = (
             *("collect.frames", "out", *RESOLVED, *PARALLEL),
         ),
     ),
+    staged("tune-law", takes=("out", *RESOLVED), panel=TOOLS),
     staged(
         "train-encoder",
         takes=(
@@ -171,6 +172,12 @@ COMMANDS = (
         further="Methods hold-decay, hold-decay-linear, chunk and chunk-forces, on a trained "
         "model's encoder.",
         takes=("dataset", "checkpoint", "out", *COMPUTED),
+    ),
+    staged(
+        "train-fusion",
+        further="Conditions are those of [conditions] and payload in --config FILE.toml.",
+        takes=("protocol.payload", "dataset", "checkpoint", "out", *COMPUTED),
+        panel=TOOLS,
     ),
     staged(
         "eval",

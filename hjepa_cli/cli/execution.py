@@ -11,23 +11,17 @@ from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 
 from hjepa_cli.cli.commands import Command, Given
-from hjepa_cli.compute import torchrun
+from hjepa_cli.compute import memory, torchrun
 from hjepa_cli.compute.interrupts import exit_code, sigterm_raises
 from hjepa_cli.config.checks import resolve
 from hjepa_cli.config.schema import RECORDED, declared
 from hjepa_cli.config.settings import locate
-from hjepa_cli.errors import HjepaError, Interrupted, StorageError, Unsealed, UsageError
+from hjepa_cli.errors import Interrupted, Unlocked, Unsealed, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan
 from hjepa_cli.storage.peeking import any_of
 
 NAMING = ("dataset", "encoder", "checkpoint")  # inputs that say which plant they are of
-
-
-class PipeClosed(HjepaError):
-    """Whoever read our output has gone, as in ``hjepa scale | head -1``: we end without a word."""
-
-    exit_code = StorageError.exit_code
 
 
 def execute(command: Command, given: Given) -> None:
@@ -50,6 +44,7 @@ def execute(command: Command, given: Given) -> None:
             planned = plan(**{name: inputs[name] for name in wanted if name != "screen"})
             if not isinstance(planned, Plan):
                 raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")
+            memory.check(planned.memory_bytes, command.name)
             planned.show(screen)
             return
         from hjepa_cli.compute.executors import placed
@@ -101,12 +96,11 @@ def _guard(screen: Screen) -> Iterator[None]:
     """Catch what Typer would turn into exit codes of its own, and say warnings in our words."""
     try:
         with sigterm_raises(), warnings.catch_warnings():
-            warnings.simplefilter("default", Unsealed)
+            for ours in (Unsealed, Unlocked):
+                warnings.simplefilter("default", ours)
             warnings.showwarning = lambda message, *_, **__: screen.say(f"warning: {message}")
             yield
     except KeyboardInterrupt as error:
         raise Interrupted(
             "interrupted", hint="run the same command again", code=exit_code(error)
         ) from None
-    except BrokenPipeError:
-        raise PipeClosed("output closed") from None

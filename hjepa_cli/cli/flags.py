@@ -4,6 +4,7 @@ Those that override a setting follow from its declaration in :mod:`hjepa_cli.con
 others are declared here. A flag that is not given is ``None`` and changes nothing.
 """
 
+import contextlib
 import dataclasses
 import typing
 from collections.abc import Callable, Iterable, Mapping
@@ -137,12 +138,19 @@ _FILES = {
         "A,B",
         default="pdf",
     ),
-    "dataset": Input(Path, "--dataset", "Dataset to read. Without it: the newest in data/.", "DIR"),
+    "dataset": Input(
+        Path,
+        "--dataset",
+        "Dataset to read. Without it: the newest in data/.",
+        "DIR",
+        complete=completion.datasets,
+    ),
     "dataset:clean": Input(
         Path,
         "--dataset",
         "Dataset whose clean rollouts to predict. Without it: simulated again from the seed.",
         "DIR",
+        complete=completion.datasets,
     ),
     "encoder": _model(
         "--encoder",
@@ -154,7 +162,7 @@ _FILES = {
     ),
 }
 _ARGUMENTS = {
-    "directory": _argument(Path, "The run's directory.", "RUN", default=...),
+    "directory": _argument(Path, "The run's directory.", "RUN", completion.resumable, default=...),
     "name_or_path": _argument(
         str, "A zoo name or a path.", "NAME|PATH", completion.models, default=...
     ),
@@ -308,6 +316,7 @@ _LOOP = {
         "--methods",
         "Only these, separated by commas: the first against the others. Without it: all found.",
         "A,B,C",
+        complete=completion.several(lambda: METHODS),
     ),
     "methods:view": Input(
         tuple[str, ...],
@@ -315,6 +324,7 @@ _LOOP = {
         "Methods on embeddings, one row each, separated by commas.",
         "A,B,C",
         default="hjepa,hold",
+        complete=completion.several(lambda: METHODS),
     ),
     "devices": Input(Count, "--devices", "Devices side by side.", default=3),
     "every": Input(
@@ -427,7 +437,13 @@ def taken(name: str) -> Input:
     hint = declared()[name]
     flag = flag_of(hint)
     assert flag is not None, f"{name} has no flag"
-    offered = None if flag.metavar or name not in NAMES else lambda: list(NAMES[name])
+    offered: Callable[..., list[str]] | None = None
+    if name in NAMES:
+        listed = typing.get_origin(bare(hint)) is tuple
+        named = lambda: list(NAMES[name])  # noqa: E731
+        offered = completion.several(named) if listed else named
+    elif name == "protocol.payload":
+        offered = completion.payloads
     panel = LOOP if name == "methods" else PANELS[name.rpartition(".")[0]]
     return Input(hint, **vars(flag), complete=offered, panel=panel)
 
@@ -484,9 +500,19 @@ def parser(kind: Any, unit: float = 1.0) -> Callable[[Any], Any] | None:
             value = float(text) * unit if plain is float else int(text) if plain is int else text
             return msgspec.convert(value, kind)
         except (ValueError, OverflowError, msgspec.ValidationError):
-            raise typer.BadParameter(f"'{text}' is not {must_be(kind, unit)}") from None
+            wrong = f"'{text}' is not {must_be(kind, unit)}"
+            if unit != 1.0 and _fits(text, kind):  # in the setting's own unit, not in the flag's
+                wrong += f"; did you mean {float(text) / unit:g}?"
+            raise typer.BadParameter(wrong) from None
 
     return parse
+
+
+def _fits(text: Any, kind: Any) -> bool:
+    with contextlib.suppress(ValueError, OverflowError, msgspec.ValidationError):
+        msgspec.convert(float(text), kind)
+        return True
+    return False
 
 
 def split_names(text: str) -> list[str]:

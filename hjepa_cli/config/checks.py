@@ -77,6 +77,7 @@ def check_settings(settings: Settings) -> None:
             key="protocol.gaps",
         )
     check_payload(settings.protocol.payload)
+    _check_link(settings.protocol)
     _check_names(SCHEDULERS, settings.radio.schedulers, "radio.schedulers")
     if settings.conditions.pole_length != 1:
         PLANTS[settings.plant].with_pole_length(settings.conditions.pole_length)
@@ -162,6 +163,18 @@ def check_gaps(protocol: ProtocolSettings) -> None:
             "scored; expected gaps no longer than that",
             hint=f"steps = {longest} or more, or shorter gaps, in --config FILE.toml",
             key="protocol.gaps",
+        )
+
+
+def _check_link(protocol: ProtocolSettings) -> None:
+    """Raise UsageError where the first packet may arrive when all is over."""
+    latest = protocol.delay_steps + protocol.jitter_steps
+    if latest >= protocol.total_steps:
+        raise UsageError(
+            f"packets may come {latest} steps late, and there are {protocol.total_steps} steps; "
+            "nobody would be heard",
+            hint="less --delay-steps and --jitter-steps, or more steps in --config FILE.toml",
+            key="protocol.delay_steps" if protocol.delay_steps else "protocol.jitter_steps",
         )
 
 

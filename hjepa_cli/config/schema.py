@@ -20,15 +20,21 @@ LARGEST_SEED = 2**63 - 1
 RECORDED = "recorded"  # the plant of imported datasets
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 
-Count = Annotated[int, Meta(ge=1)]
-CountFromTwo = Annotated[int, Meta(ge=2)]  # nothing is learned without a next one
-CountOrNone = Annotated[int, Meta(ge=0)]
+MOST = 10**9  # of anything: beyond what any machine holds or any program counts
+WIDEST = 2**16  # values of an embedding or a layer
+
+Count = Annotated[int, Meta(ge=1, le=MOST)]
+CountFromTwo = Annotated[int, Meta(ge=2, le=MOST)]  # nothing is learned without a next one
+CountOrNone = Annotated[int, Meta(ge=0, le=MOST)]
+Width = Annotated[int, Meta(ge=1, le=WIDEST)]
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
+GreyLevels = Annotated[float, Meta(ge=0, le=255)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
 SidePx = Annotated[int, Meta(ge=16, le=1024)]  # of a picture
 Sign = Annotated[float, Meta(ge=-1, le=1)]
+Candidates = Annotated[int, Meta(ge=4, le=10_000)]  # of a round of CMA-ES
 Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
 
 
@@ -126,8 +132,8 @@ class EncoderSettings:
         Count,
         Flag("--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
     ] = 2
-    embedding: Count = 256
-    hidden: Count = 1024
+    embedding: Width = 256
+    hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
     frame_input: Literal["difference", "pair"] = "difference"
     stride_actions: Literal["all", "held"] = "all"
@@ -150,7 +156,7 @@ class EncoderSettings:
     mirror: Literal["exact", "augment", "none"] = "exact"
     shift_px: CountOrNone = 8  # sideways; no further than every cart stays in the picture
     light_spread: BelowOne = 0.0  # training pictures: each trajectory in a light of 1 ± this
-    camera_noise: NotNegative = 0.0  # and with noise of up to this standard deviation, of 255
+    camera_noise: GreyLevels = 0.0  # and with noise of up to this standard deviation, of 255
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     gate: Annotated[
         bool,
@@ -179,7 +185,7 @@ class EncoderSettings:
 class ActorSettings:
     """Both training stages fit the semantic actor."""
 
-    hidden: Count = 1024
+    hidden: Width = 1024
     dropout: BelowOne = 0.2
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     learning_rate: NotNegative = 1e-3
@@ -231,11 +237,28 @@ class ReflexSettings:
     gradient_clip: NotNegative = 1.0
     search_devices: Count = 32  # on the true state, of gains and decay together
     search_steps: Count = 1000
-    search_candidates: Count = 48
+    search_candidates: Candidates = 48
     search_rounds: Count = 10
     fit_devices: Count = 24  # on embeddings, of a factor and the decay
-    fit_candidates: Count = 12
+    fit_candidates: Candidates = 12
     fit_rounds: Count = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class FusionSettings:
+    """``train-fusion`` learns what to make of packets that are not quite right.
+
+    They are those of devices in the settings' [conditions], quantised as [protocol] says.
+    """
+
+    rounds: Count = 12  # of loops, then training on them
+    devices: Count = 32  # in the conditions, and as many in none
+    loop_steps: Count = 700
+    steps: Count = 300  # of training in a round
+    batch: Count = 256
+    learning_rate: NotNegative = 1e-3
+    weight_decay: NotNegative = 1e-2
+    gradient_clip: NotNegative = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,6 +327,11 @@ class ProtocolSettings:
         return self.warmup_steps + self.steps
 
     @property
+    def ideal_link(self) -> bool:
+        """Return whether packets come at once and every force arrives, as in the paper."""
+        return not any(getattr(self, key) for key in IDEAL_LINK)
+
+    @property
     def velocity_noise(self) -> tuple[float, ...]:
         """Return the standard deviation of what disturbs a step, one per state."""
         return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
@@ -328,15 +356,30 @@ class ControlSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class TuneSettings:
+    """``tune-law`` searches both laws on the true state.
+
+    Errors are standard deviations in units of those that states have under the teacher.
+    """
+
+    devices: Count = 24
+    steps: Count = 2000  # scored, after the protocol's warm-up
+    candidates: Candidates = 12
+    rounds: Count = 24
+    packet_error: NotNegative = 0.05  # of the state that a packet tells
+    actor_error: NotNegative = 0.2  # of the state that the law sees, anew at every step
+
+
+@dataclasses.dataclass(frozen=True)
 class ConditionSettings:
     """Devices of ``eval`` and ``scale`` may differ so from those that models were trained on.
 
     Beside ``protocol.plant_spread``; controllers do not know.
     """
 
-    light: Positive = 1.0  # factor on what the camera sees
-    camera_noise: NotNegative = 0.0  # standard deviation in every pixel, of 255
-    pole_length: Positive = 1.0  # ÷ the nominal one
+    light: Annotated[float, Meta(gt=0, le=255)] = 1.0  # factor on what the camera sees
+    camera_noise: GreyLevels = 0.0  # standard deviation in every pixel, of 255
+    pole_length: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # ÷ the nominal one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -451,6 +494,8 @@ class Settings:
         *("hold", "optimal", "oracle"),
     )
     control: ControlSettings = ControlSettings()
+    tune: TuneSettings = TuneSettings()
+    fusion: FusionSettings = FusionSettings()
     camera: CameraSettings = CameraSettings()
     recorded: RecordedSettings = RecordedSettings()
     collect: CollectSettings = CollectSettings()

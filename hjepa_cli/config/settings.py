@@ -32,6 +32,7 @@ from hjepa_cli.errors import DataError, MissingInputError, UsageError, choices
 from hjepa_cli.plugins import LAWS, PLANTS, read_regular
 
 _FOLDER = resources.files("hjepa_cli.config") / "presets"
+_CONTROL_LAWS = resources.files("hjepa_cli.config") / "control_laws.toml"
 PRESETS = ("default", *sorted(Path(entry.name).stem for entry in _FOLDER.iterdir()))
 PROTOCOLS = ("steady", "paper")  # scored after a warm-up, or from the start on as in the paper
 
@@ -57,7 +58,7 @@ def load_settings(
     config: str | Path | None = None,
     flags: Mapping[str, Any] | None = None,
 ) -> Settings:
-    """Merge default < preset < config file < flags.
+    """Merge default < control law of the plant < preset < config file < flags.
 
     A plant has its own ranges and noise, so ``plant`` in flags or file alone means its preset.
 
@@ -166,6 +167,10 @@ def _layers(
         values = tomllib.loads((_FOLDER / f"{preset}.toml").read_text(encoding="utf-8"))
         paper.append(values.get("protocol", {}).pop("paper", {}))
         layers.append(Layer(f"preset {preset}", values))
+    plants = [flags.get("plant"), *(one.values.get("plant") for one in reversed([*layers, *file]))]
+    plant = next(one for one in plants if one is not None)
+    if law := _control_laws().get(plant):
+        layers.insert(1, Layer(f"tuned law of {plant}", {"control": law}))
     if protocol == "paper":
         layers += [Layer("protocol paper", {"protocol": values}) for values in paper]
     layers += file
@@ -175,6 +180,12 @@ def _layers(
                 value = {name: value}
             layers.append(Layer("flag", value))
     return preset, layers
+
+
+@functools.cache
+def _control_laws() -> dict[str, Any]:
+    """Return the section [control] of each plant that has one, as ``tune-law`` found it."""
+    return tomllib.loads(_CONTROL_LAWS.read_text(encoding="utf-8"))
 
 
 def _read_config(path: Path) -> Layer:

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.config.checks import check_settings
@@ -36,7 +37,13 @@ from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import PLANTS
 from hjepa_cli.stages.plan import Plan, seconds_of
-from hjepa_cli.storage.files import check_free_space, point_to, refuse_foreign
+from hjepa_cli.storage.files import (
+    check_free_space,
+    holding,
+    identity,
+    point_to,
+    refuse_foreign,
+)
 from hjepa_cli.storage.runs import continue_command, differences
 from hjepa_cli.storage.shards import (
     LOG,
@@ -141,6 +148,7 @@ def plan(settings: Settings, *, out: Path | None = None) -> Plan:
         writes=[f"dataset {directory} in {len(shards_of(settings))} shards"],
         writes_bytes=size_bytes(settings),
         seconds=2 + seconds_of({"simulated steps": steps, "rendered frames": frames}),
+        memory_bytes=memory_bytes(settings),
     )
 
 
@@ -174,7 +182,8 @@ def telling_how_to_go_on(directory: Path) -> Iterator[None]:
             code=exit_code(error),
         ) from None
     except HjepaError as error:
-        point_to(continue_command(directory), error)
+        if (directory / LOG).exists():  # else nothing is there yet that could be resumed
+            point_to(continue_command(directory), error)
         raise
 
 
@@ -228,6 +237,7 @@ def check(settings: Settings) -> None:
             f"{total} trajectories; one dataset holds at most {most}",
             hint="collect several, each with its own --seed and --out DIR",
         )
+    memory.check(memory_bytes(settings), "a shard of such trajectories")
 
 
 def shards_of(settings: Settings) -> list[Shard]:
@@ -253,7 +263,7 @@ def make_shards(
     screen.say(
         f"collecting trajectories of plant {settings.plant}: {len(left)} of {len(shards)} shards"
     )
-    make = functools.partial(make_shard, settings, directory)
+    make = functools.partial(make_shard, settings, directory, identity(directory))
     enough = sum(count * steps for count, steps in sizes.values()) >= WORTH_WORKERS
     with (
         screen.progress("collect", total, "trajectories", done=total - to_do) as bar,
@@ -265,13 +275,16 @@ def make_shards(
     return [log.done[shard.name] for shard in shards]
 
 
-def make_shard(settings: Settings, directory: Path, shard: Shard) -> Described:
+def make_shard(
+    settings: Settings, directory: Path, which: tuple[str, int], shard: Shard
+) -> Described:
     """Do a unit of parallel work: decided by its arguments, written atomically, so repeatable."""
     made = generate(settings, shard.split, range(shard.start, shard.stop))
     if settings.collect.frames == "stored":
         camera = camera_of(plant(settings.plant), settings.camera)
         made = dataclasses.replace(made, frames=frames_of(camera, made.states, TOGETHER))
-    return write_shard(directory, shard, made, settings.plant, settings.as_dict())
+    with holding(directory, which):
+        return write_shard(directory, shard, made, settings.plant, settings.as_dict())
 
 
 def size_bytes(settings: Settings) -> int:
@@ -283,6 +296,19 @@ def size_bytes(settings: Settings) -> int:
     return sum(
         count * ((steps + 1) * (state_bytes + frame_bytes) + force_bytes * steps)
         for count, steps in split_sizes(settings.collect).values()
+    )
+
+
+def memory_bytes(settings: Settings) -> int:
+    """Return what the largest shard takes while it is made: drawn, simulated, as it is written."""
+    collect, kind = settings.collect, plant_of(settings)
+    states, forces = len(kind.state_names), math.prod(kind.action_shape)
+    stored = collect.frames == "stored"
+    row_bytes = 8 * (states + 4 * forces) + 8 * (states + 2 * forces)
+    row_bytes += 2 * frame_bits(settings.camera.frame_shape) // 8 * stored
+    return max(
+        min(count, per_shard(stored)) * (steps + 1) * row_bytes
+        for count, steps in split_sizes(collect).values()
     )
 
 

@@ -21,6 +21,7 @@ from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen, in_order
 from hjepa_cli.output.tables import show_offline
 from hjepa_cli.plugins import METHODS
+from hjepa_cli.stages import results
 from hjepa_cli.stages.inputs import brought_along, open_dataset
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
@@ -45,17 +46,18 @@ def run(
     data, models = open_recorded(settings, screen, checkpoint, dataset, further)
     inputs = models.inputs(remeasure=False, figure=False)
     with Run.create("eval", out, models.settings.as_dict(), inputs) as record:
-        result = record.result
+        result = kept = record.result
         if result is None:
             recorded = data.split(data.rollouts)
             assert recorded.frames is not None
             with screen.progress("eval", len(methods_of(models)), "methods") as bar:
                 result = measured(models, data, recorded, advance=bar.advance)
             result = record.finish(result)
-        else:
-            screen.say(f"{record.directory} is finished; this is its result")
-            result["methods"] = in_order(result["methods"], settings.methods)
-        show_offline(result, screen)
+        with results.showing("eval", kept, record.directory):
+            if kept is not None:
+                screen.say(f"{record.directory} is finished; this is its result")
+                result["methods"] = in_order(result["methods"], settings.methods)
+            show_offline(result, screen)
         return result
 
 

@@ -28,7 +28,7 @@ from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, plant_of
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.core.training.batches import shift_sideways
 from hjepa_cli.core.training.rendered import RenderedSplit
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen
 
 CHUNK = 20  # trajectories rendered or encoded at a time: progress shows, memory stays small
@@ -111,6 +111,15 @@ def brought_along(settings: Settings, record: Mapping[str, Any], where: object) 
     mirror = settings.encoder.mirror if known.mirror else "none"
     encoder = dataclasses.replace(settings.encoder, mirror=mirror, shift_px=0)
     return dataclasses.replace(settings, recorded=known, encoder=encoder)
+
+
+def refuse_recorded(settings: Settings, why: str) -> None:
+    """Raise UsageError for a recorded plant in a stage that needs equations; ``why`` says so."""
+    if settings.plant == RECORDED:
+        raise UsageError(
+            f"{why}; a recorded plant has no equations",
+            hint="hjepa eval --dataset DIR compares methods that need none",
+        )
 
 
 def check_same_plant(metadata: Mapping[str, Any], settings: Settings, what: str) -> None:

@@ -4,7 +4,6 @@ The run remembers its settings (``config.toml``) and what it was given (``enviro
 """
 
 import dataclasses
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from hjepa_cli.compute import torchrun
 from hjepa_cli.config.checks import check_settings
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.datasets.dataset import MANIFEST
-from hjepa_cli.errors import DataError, MissingInputError, UsageError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import STAGES
 from hjepa_cli.stages import import_data
@@ -100,7 +99,7 @@ def recall(directory: Path, screen: Screen) -> tuple[Stage, Settings, dict[str, 
         kept = isinstance(words, list) and all(isinstance(word, str) for word in words)
         raise MissingInputError(
             f"{directory} was stopped before its settings were kept: there is nothing to continue",
-            hint=shlex.join(["hjepa", *words[1:]]) if kept else None,
+            hint=shell(["hjepa", *words[1:]]) if kept else None,
         )
     preset, made_by = found.get("preset"), version_of(found) or __version__
     if preset is not None and not isinstance(preset, str):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.capacity import Cell
@@ -55,7 +56,8 @@ class ByTolerance(ByFormula):
         self._steps, self._kind = tolerance_steps, plant_of(settings)
         self._cell = Cell.of(settings.radio, self._kind)
         embedding = model.architecture["embedding"] if model else settings.encoder.embedding
-        self._bits = CODECS[settings.protocol.payload].bits(embedding)
+        told = link.confirmation_bits(settings.protocol, len(self._kind.force_signs))
+        self._bits = CODECS[settings.protocol.payload].bits(embedding) + told
         self._name = f"{tolerance_steps:g} steps"
 
     def measured_methods(self, grid_db: Sequence[float]) -> dict[float, list[str]]:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import RECORDED, Settings
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.drivers import coder_of, methods_of
 from hjepa_cli.core.control.sensors import embedding_sensor
@@ -32,7 +32,7 @@ from hjepa_cli.core.training.decay_fit import Law, Trial
 from hjepa_cli.core.training.optimiser import Optimiser, name_samples
 from hjepa_cli.core.training.reflex_training import Plans
 from hjepa_cli.core.training.rendered import RenderedSplit
-from hjepa_cli.errors import DataError, MissingInputError, UsageError
+from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_reflex
 from hjepa_cli.stages import train_hierarchy
@@ -52,6 +52,7 @@ from hjepa_cli.stages.inputs import (
     count_frames,
     embed,
     open_dataset,
+    refuse_recorded,
 )
 from hjepa_cli.stages.model_set import default_model
 from hjepa_cli.stages.plan import Plan, found
@@ -86,7 +87,7 @@ def run(
         DataError: model and dataset belong to different plants, or the model has no actor.
         NumericalError: training diverged.
     """
-    _refuse_recorded(settings)
+    refuse_recorded(settings, "reflexes are trained on what the teacher does elsewhere")
     data = open_training_data(dataset, settings)
     settings = brought_along(settings, data[0].settings, data[0].path)
     source = open_model(checkpoint, settings, screen)
@@ -108,7 +109,7 @@ def plan(
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
-    _refuse_recorded(settings)
+    refuse_recorded(settings, "reflexes are trained on what the teacher does elsewhere")
     settings = brought_along(settings, data.settings, data.path) if data else settings
     find = functools.partial(open_model, checkpoint, settings, Screen(quiet=True))
     _, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
@@ -207,14 +208,6 @@ def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> C
     return checkpoint
 
 
-def _refuse_recorded(settings: Settings) -> None:
-    if settings.plant == RECORDED:
-        raise UsageError(
-            "reflexes are trained on what the teacher does elsewhere; a recorded plant has none",
-            hint="hjepa eval --dataset DIR compares with hold, zero and ts-jepa",
-        )
-
-
 def describe_architecture(
     settings: Settings, begun: dict[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -307,7 +300,8 @@ def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[st
     searched = {"candidates": options.search_candidates, "rounds": options.search_rounds}
     screen.say("searching laws whose force fades, on the true state")
     kind, devices = plant_of(settings), options.search_devices
-    trial = Trial.make(kind, protocol, devices=devices, steps=options.search_steps, seed=seed)
+    act = control_law(kind, settings.control)
+    trial = Trial.make(kind, act, protocol, devices=devices, steps=options.search_steps, seed=seed)
     law, _ = decay_fit.search_law(trial, seed=seed, **searched)
     faded, gain = decay_fit.search_law(trial, seed=seed, tied=True, **searched)
     said = {

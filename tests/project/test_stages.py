@@ -43,7 +43,10 @@ def test_listing_stages_imports_nothing_heavy():
     done = subprocess.run(
         [sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=False
     )
-    pipeline = "collect train-encoder train-hierarchy train-reflex eval scale reproduce"
+    pipeline = (
+        "tune-law collect train-encoder train-hierarchy train-reflex train-fusion eval scale "
+        "reproduce"
+    )
     assert (done.returncode, done.stdout) == (0, f"{pipeline}\n"), done.stderr
 
 

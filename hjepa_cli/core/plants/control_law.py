@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from hjepa_cli.config.schema import ControlSettings
 from hjepa_cli.core.arrays import Floats, finite
+from hjepa_cli.core.plants.linear import linearise
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.errors import DataError, UsageError
 
@@ -38,7 +39,7 @@ class LinearLaw:
         # A sum of products, not a matrix product: a state's force must not depend on its batch.
         forces_n = -(self.gains_n * finite(states, "states")[..., None, :]).sum(axis=-1)
         forces_n = forces_n.clip(-self.force_limit_n, self.force_limit_n)
-        return np.asarray(forces_n.reshape(*forces_n.shape[:-1], *self.action_shape))
+        return np.asarray(forces_n.reshape((*forces_n.shape[:-1], *self.action_shape)))
 
 
 def control_law(kind: System, control: ControlSettings) -> Teacher:
@@ -76,6 +77,20 @@ def control_of(settings: Mapping[str, Any], where: object) -> ControlSettings:
         raise DataError(f"{where} holds no valid control law: {flaw}") from None
 
 
+def check_stable(kind: System, gains_n: Floats, key: str) -> None:
+    """Raise UsageError unless a law K [F, S] holds a plant at rest, heard at every step."""
+    states = len(kind.state_names)
+    a, b = linearise(kind.advance, np.zeros(states), np.zeros(kind.action_shape))
+    growth = np.abs(np.linalg.eigvals(a - b @ gains_n)).max()
+    if growth >= 1:
+        raise UsageError(
+            f"{key} does not hold plant {kind.name}: near rest a deviation grows by a factor of "
+            f"{growth:.4f} a step",
+            hint=f"hjepa tune-law --plant {kind.name}",
+            key=key,
+        )
+
+
 def _linear(kind: System, key: str, gains_n: tuple[float, ...]) -> LinearLaw:
     forces, states = len(kind.force_signs), len(kind.state_names)
     if len(gains_n) != forces * states:
@@ -85,4 +100,6 @@ def _linear(kind: System, key: str, gains_n: tuple[float, ...]) -> LinearLaw:
             hint=f"hjepa tune-law --plant {kind.name}",
             key=f"control.{key}",
         )
-    return LinearLaw(np.reshape(gains_n, (forces, states)), kind.force_limit_n, kind.action_shape)
+    gains = np.reshape(gains_n, (forces, states))
+    check_stable(kind, gains, f"control.{key}")
+    return LinearLaw(gains, kind.force_limit_n, kind.action_shape)

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hjepa_cli.core.arrays import Bools, Floats, Pixels, finite
+from hjepa_cli.core.arrays import Bools, Floats, Pixels, described, finite
 from hjepa_cli.core.plants.linear import linearise, unstable_rate_rad_s
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import ArrayError, UsageError
 from hjepa_cli.plugins import check_members
 
 Teacher = Callable[[ArrayLike], Floats]
@@ -89,12 +89,12 @@ def check_states(states: ArrayLike, shape: tuple[int, ...], name: str = "states"
     """Return states, called so in messages, as float64.
 
     Raises:
-        ValueError: their shape is another one.
+        ArrayError: their shape is another one.
         NumericalError: one is not finite.
     """
     checked = finite(states, name)
     if checked.shape != shape:
-        raise ValueError(f"{name}: shape {checked.shape}, not {shape}")
+        raise ArrayError(f"{name}: shape {checked.shape}, not {shape}; it is {described(checked)}")
     return checked
 
 
@@ -102,8 +102,9 @@ def check_rows(states: ArrayLike, names: tuple[str, ...]) -> Floats:
     """Return states ``[n, S]``, as named, as float64; errors as of :func:`check_states`."""
     checked = finite(states, "states")
     if checked.ndim != 2 or checked.shape[1] != len(names):
-        raise ValueError(
-            f"states: shape {checked.shape}, not (n, {len(names)}): {', '.join(names)}"
+        raise ArrayError(
+            f"states: shape {checked.shape}, not (n, {len(names)}): {', '.join(names)}; they are "
+            f"{described(checked)}"
         )
     return checked
 
