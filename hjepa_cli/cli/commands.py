@@ -18,7 +18,7 @@ from hjepa_cli.stages.stage import Imported
 
 PIPELINE, TOOLS = "Pipeline", "Tools"
 GROUPS = {
-    "data": "Describe, verify, look at and export datasets.",
+    "data": "Import, describe, verify, look at and export datasets.",
     "models": "List, describe and verify trained models.",
     "config": "Show settings.",
 }
@@ -26,7 +26,9 @@ GROUPS = {
 RESOLVED = ("preset", "config", "plant", "seed")  # what takes these is given settings
 COMPUTED = (*RESOLVED, "device")
 PARALLEL = ("workers", "cluster")
-SHARED = ("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify")  # by stages
+SHARED = (
+    *("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify", "tolerance_steps"),
+)  # by stages
 LOOP = ("methods", "protocol")
 LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss")
 MEASURED = (
@@ -121,7 +123,8 @@ def _add_sources(settings: Settings, given: Given) -> None:
 SCALE = (
     *("radio.snr_db", "radio.law", "radio.schedulers", "radio.uncertainty", "radio.topology"),
     *("radio.bandwidth_hz", "radio.noise", "radio.power_margin_db", "radio.coherence_slots"),
-    *("radio.seeds", *MEASURED, "remeasure", "verify", "checkpoint", "dataset:clean", "out"),
+    *("radio.seeds", *MEASURED, "remeasure", "verify", "tolerance_steps", "checkpoint"),
+    *("dataset:clean", "out"),
 )
 
 
@@ -221,6 +224,26 @@ COMMANDS = (
         Imported("hjepa_cli.stages.compare:run"),
         ("paths:evaluations", "methods:compare", "figures:compare", "formats"),
         panel=TOOLS,
+    ),
+    Command(
+        "data import",
+        "Make a dataset of recorded pictures and actions, of a plant that hjepa does not know.",
+        Imported("hjepa_cli.stages.import_data:run"),
+        (
+            *("source", "test", "clean", "kind:import", "size", "grey", "limit"),
+            *(
+                "fps:import",
+                "action_offset",
+                "steps:import",
+                "held_out",
+                "mirror_signs",
+                "actions",
+                "states",
+            ),
+            *("expert", "camera", "skip_bad", "out"),
+        ),
+        plan=Imported("hjepa_cli.stages.import_data:plan"),
+        product="dataset",
     ),
     Command(
         "data info",

@@ -62,7 +62,7 @@ SCALE = _stage(
     "scale",
     "Count the devices that one radio cell supports, by method and signal-to-noise ratio.",
     "scale",
-    inputs=("checkpoint", "further", "dataset", "remeasure", "verify"),
+    inputs=("checkpoint", "further", "dataset", "remeasure", "verify", "tolerance_steps"),
 )
 REPRODUCE = _stage(
     "reproduce", "Run all stages into one folder and write the report.", "reproduce",

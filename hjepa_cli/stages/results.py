@@ -108,6 +108,36 @@ class _Evaluation(msgspec.Struct):
     source: str = ""
 
 
+class _OfflineEntry(msgspec.Struct):
+    n_rollouts: Whole
+    nmae: list[NotNegative]
+    nmae_ci95: list[Interval]
+    nmae_windows: Windows
+    nmae_every_step: NotNegative | None
+    steps_within: dict[str, Whole]
+    bits_per_transmission: NotNegative
+
+
+class _Latent(msgspec.Struct):
+    steps: list[Whole]
+    error: list[Number]
+    still: list[Number]
+
+
+class _Offline(msgspec.Struct):
+    """What ``eval`` says of a recorded plant."""
+
+    plant: str
+    seed: Whole
+    step_s: Positive
+    checkpoint: str | None
+    dataset: str
+    split: str
+    methods: Annotated[dict[str, _OfflineEntry], Meta(min_length=1)]
+    latent: dict[str, _Latent]
+    probe_r2: Windows
+
+
 class _Scale(msgspec.Struct):
     rows: Annotated[list[_Row], Meta(min_length=1)]
     seed: Whole
@@ -184,10 +214,13 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     """Return what keeps a result from being shown, if anything."""
     if stage not in RESULTS:
         return "its stage is none of ours"
+    offline = stage == "eval" and bool(result.get("offline"))
     try:
-        msgspec.convert(result, RESULTS[stage])
+        msgspec.convert(result, _Offline if offline else RESULTS[stage])
     except msgspec.ValidationError as error:
         return str(error)
+    if offline:
+        return _offline_flaw(result)
     if stage == "eval":
         entries = result["methods"]
         former = {"tolerance_gap_lq_steps": None}  # which older ones lack
@@ -208,6 +241,20 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     return None
 
 
+def _offline_flaw(result: Mapping[str, Any]) -> str | None:
+    """Return what keeps an evaluation on recordings from being shown, if anything."""
+    entries = result["methods"]
+    for name, entry in entries.items():
+        if len(entry["nmae"]) != len(entry["nmae_ci95"]):
+            return f"method '{name}': its errors and their intervals are not as many"
+    for name, of in result["latent"].items():
+        if not len(of["steps"]) == len(of["error"]) == len(of["still"]):
+            return f"latent of '{name}': its lists are not equally long"
+    return _unlike("methods", [entry["nmae_windows"] for entry in entries.values()]) or _unlike(
+        "methods", [entry["steps_within"] for entry in entries.values()]
+    )
+
+
 def _unlike(what: str, windows: list[dict[str, Any]]) -> str | None:
-    """Return the complaint where not all have the same windows of steps."""
+    """Return the complaint where not all have the same keys, windows of steps as a rule."""
     return f"its {what} have different windows" if len({*map(frozenset, windows)}) > 1 else None
