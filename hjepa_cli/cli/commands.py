@@ -111,7 +111,14 @@ def _check_cell(settings: Settings, given: Given) -> None:
 
     parse_snr(settings.radio.snr_db)
     keys = (name.partition(":")[0] for name in SCALE)
-    check_cell(settings.radio, {key: given[key] for key in keys})
+    check_cell(settings.radio, {key: given[key] for key in keys}, settings.nr)
+
+
+def _check_survival(settings: Settings, given: Given) -> None:
+    from hjepa_cli.core.radio.capacity import parse_snr
+
+    parse_snr(settings.radio.snr_db)
+    check_cell(settings.radio, nr=settings.nr)
 
 
 def _add_sources(settings: Settings, given: Given) -> None:
@@ -123,6 +130,9 @@ def _add_sources(settings: Settings, given: Given) -> None:
 SCALE = (
     *("radio.snr_db", "radio.law", "radio.schedulers", "radio.uncertainty", "radio.topology"),
     *("radio.bandwidth_hz", "radio.noise", "radio.power_margin_db", "radio.coherence_slots"),
+    *("radio.fading", "radio.speed_m_s", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+    *("nr.pusch_symbols", "nr.mcs_table", "nr.mcs", "nr.bler_target", "nr.link_adaptation"),
+    *("nr.cqi_age_slots", "nr.harq_rounds", "nr.grants", "nr.grants_per_slot", "nr.reports"),
     *("radio.seeds", *MEASURED, "remeasure", "verify", "tolerance_steps", "checkpoint"),
     *("dataset:clean", "out"),
 )
@@ -188,6 +198,17 @@ COMMANDS = (
         prepare=_figure_of_all,
     ),
     staged("scale", takes=(*SCALE, *COMPUTED, *PARALLEL), check=_check_cell),
+    staged(
+        "survive",
+        takes=(
+            *("survival.intervals_steps", "survival.loops", "survival.splitting_paths"),
+            *("survival.loss", "survival.burst_transfers", "survival.mean_time_h"),
+            *("radio.snr_db", "radio.bandwidth_hz", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+            *("nr.pusch_symbols", "nr.bler_target", "nr.harq_rounds"),
+            *(*MEASURED, "checkpoint", "out", *COMPUTED, *PARALLEL),
+        ),
+        check=_check_survival,
+    ),
     Command(
         "resume",
         "Take up an interrupted run: same settings, same inputs, same result.",

@@ -31,12 +31,13 @@ from hjepa_cli.config.schema import (
 )
 from hjepa_cli.config.settings import PRESETS, PROTOCOLS
 from hjepa_cli.errors import MissingInputError
-from hjepa_cli.plugins import LAWS, METHODS, PLANTS, SCHEDULERS
+from hjepa_cli.plugins import LAWS, METHODS, PHYS, PLANTS, SCHEDULERS
 
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
 SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
 PANELS = {  # of help, by section
     "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "radio": RADIO,
+    "nr": RADIO, "survival": LOOP,
     "": SETTINGS,
 }  # fmt: skip
 
@@ -46,6 +47,7 @@ NAMES: Mapping[str, Iterable[str]] = {
     "methods": METHODS,
     "radio.schedulers": SCHEDULERS,
     "radio.law": LAWS,
+    "radio.phy": PHYS,
 }
 
 
@@ -401,8 +403,8 @@ _SETTINGS = {
     "plugin": Input(
         list[Path],
         "--plugin",
-        "Python file that adds plants, codecs, schedulers, methods, laws or stages; may be "
-        "repeated.",
+        "Python file that adds plants, codecs, schedulers, methods, laws, physical layers or "
+        "stages; may be repeated.",
         "FILE.py",
         default=[],
     ),

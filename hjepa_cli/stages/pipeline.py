@@ -64,6 +64,12 @@ SCALE = _stage(
     "scale",
     inputs=("checkpoint", "further", "dataset", "remeasure", "verify", "tolerance_steps"),
 )
+SURVIVE = _stage(
+    "survive",
+    "Measure how long loops go on without expected packets, and what links that takes.",
+    "survive",
+    inputs=("checkpoint", "further"),
+)
 REPRODUCE = _stage(
     "reproduce", "Run all stages into one folder and write the report.", "reproduce",
     product="report",

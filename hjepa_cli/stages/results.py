@@ -22,6 +22,7 @@ LARGEST = 1e100  # bounds beyond anything that is measured keep arithmetic in ra
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=1e-100, le=LARGEST)]
+Probability = Annotated[float, Meta(ge=0, le=1)]
 Whole = Annotated[int, Meta(ge=0, le=10**18)]
 Interval = tuple[NotNegative, NotNegative]
 Windows = dict[str, Number | None]
@@ -65,7 +66,7 @@ class _Row(msgspec.Struct):
     tolerance_ci95: Interval | None = None
     delay_steps: NotNegative | None = 0
     reports_per_block_slot: NotNegative | None = None
-    coverage: Annotated[float, Meta(ge=0, le=1)] | None = None
+    coverage: Probability | None = None
 
 
 class _Gain(msgspec.Struct):
@@ -153,12 +154,56 @@ class _Scale(msgspec.Struct):
     figures: list[str] = []
 
 
+class _Lost(msgspec.Struct):
+    gap_steps: Positive
+    p_lost: Probability
+    p_lost_ci95: tuple[Probability, Probability]
+    p_left_band: Probability
+    back_steps_median: NotNegative | None
+    back_steps_p95: NotNegative | None
+
+
+class _Losses(msgspec.Struct):
+    method: str
+    interval_steps: Positive
+    points: Annotated[list[_Lost], Meta(min_length=1)]
+
+
+class _SurvivalTime(msgspec.Struct):
+    method: str
+    transfer_interval_s: Positive
+    loss_probability: Probability
+    how: str
+    at_least: bool
+    survival_steps: NotNegative
+    survival_ci95: tuple[NotNegative, NotNegative | None]
+    tolerance_gap_steps: NotNegative | None
+    availability: Probability | None
+    tolerated_loss: Probability
+    tolerated_loss_bursts: Probability
+    devices: Whole
+
+
+class _Survival(msgspec.Struct):
+    plant: str
+    seed: Whole
+    step_s: Positive
+    n_loops: Annotated[int, Meta(ge=1, le=10**18)]
+    phy: str
+    bandwidth_hz: Positive
+    mean_time_h: Positive
+    rows: Annotated[list[_SurvivalTime], Meta(min_length=1)]
+    curves: Annotated[list[_Losses], Meta(min_length=1)]
+    figures: list[str] = []
+
+
 RESULTS = {
     "train-encoder": _Encoder,
     "train-hierarchy": _Hierarchy,
     "train-reflex": _Reflexes,
     "eval": _Evaluation,
     "scale": _Scale,
+    "survive": _Survival,
 }
 
 
