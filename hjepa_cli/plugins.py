@@ -55,6 +55,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "eval": "hjepa_cli.stages.pipeline:EVAL",
         "scale": "hjepa_cli.stages.pipeline:SCALE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
+        "bench-link": "hjepa_cli.stages.pipeline:BENCH_LINK",
     },
     "codec": {
         "float32": f"{_CONTROL}.codecs.float:FLOAT32",
