@@ -113,7 +113,7 @@ class Session:
         self.z: Singles | None = None
         self.planned, self.start, self.base, self.newest = 0, 0, 0, -1
         self.fresh: tuple[Embedding, int] | None = None
-        self.counter = 0
+        self.counter = self.ticket = 0
         self.embeddings = self.lost = self.answers = self.missed = self.skipped = 0
         self.source, self._count = protocol.HELD, 0
         self._forces_n = np.zeros((REMEMBERED_STEPS, hello.forces), np.float32)
@@ -126,6 +126,7 @@ class Session:
 
     def learn(self, packet: Embedding) -> None:
         """Take what a datagram says besides its embedding."""
+        guessed = self.answers == 0
         if self.embeddings:
             self.lost += (packet.count - self._count - 1) % 256
         self._count, self.embeddings, self.source = packet.count, self.embeddings + 1, packet.source
@@ -135,6 +136,8 @@ class Session:
                 return
             late = self._lateness.pop(packet.answered)
             self.answers += 1
+            if guessed:  # from the hello
+                self._delays.clear()
             self.missed += packet.lag_steps > 0
         self._delays.append(max(packet.lag_steps - late, 0))
 
@@ -204,8 +207,8 @@ class Controller:
         self._greeting = Bucket(*GREETING)
         self._nonces: collections.OrderedDict[bytes, None] = collections.OrderedDict()
         self._fresh: dict[int, Session] = {}
-        self._due: list[tuple[float, int, Session, int]] = []  # heaps by when, and what is stale
-        self._faded: list[tuple[float, int, Session, int]] = []
+        self._due: list[tuple[float, int, Session]] = []  # heaps by when, and what is stale
+        self._faded: list[tuple[float, int, Session]] = []
         self._tickets = itertools.count()
         self.counts: collections.Counter[str] = collections.Counter()
         self.waited_s: deque[float] = deque(maxlen=1024)
@@ -413,13 +416,17 @@ class Controller:
                 self._skip(session, present)
         return self._plan(sessions) if sessions else []
 
-    def _take_due(self, heap: list[tuple[float, int, Session, int]], now_s: float) -> list[Session]:
+    def _take_due(self, heap: list[tuple[float, int, Session]], now_s: float) -> list[Session]:
         """Take from a heap who is due by now, a few batches at most."""
         due: list[Session] = []
         while heap and heap[0][0] <= now_s and len(due) < 4 * BUCKETS[-1]:
-            _, _, session, planned = heapq.heappop(heap)
-            device = session.hello.device
-            if self.sessions.get(device) is session and session.planned == planned:
+            _, ticket, session = heapq.heappop(heap)
+            known = self.sessions.get(session.hello.device) is session
+            if not known or session.ticket != ticket:
+                continue
+            if heap is self._due and session.clock.step(now_s) - session.base > FADED_STEPS:
+                heapq.heappush(self._faded, (now_s, ticket, session))
+            else:
                 due.append(session)
         return due
 
@@ -427,8 +434,8 @@ class Controller:
         """Note when a device's next stride is due: some steps before it needs it."""
         faded = session.planned - session.base > FADED_STEPS
         when_s = session.clock.time_s(session.planned - self._lead)
-        entry = (when_s, next(self._tickets), session, session.planned)
-        heapq.heappush(self._faded if faded else self._due, entry)
+        session.ticket = next(self._tickets)  # older ones in the heaps are void
+        heapq.heappush(self._faded if faded else self._due, (when_s, session.ticket, session))
 
     def _skip(self, session: Session, present: int) -> None:
         """Move a device's embedding over whole strides that are past; it held its last force."""
