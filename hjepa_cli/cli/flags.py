@@ -290,9 +290,7 @@ _WIRE = {
         "What computes the networks; openvino is fast in batches (extra openvino).",
         default="onnxruntime",
     ),
-    "precision": Input(
-        Literal["fp32", "int8"], "--precision", "Of the encoder.", default="fp32"
-    ),
+    "precision": Input(Literal["fp32", "int8"], "--precision", "Of the encoder.", default="fp32"),
     "bind": _address("--bind", "Address to serve on; port 0 takes any.", "127.0.0.1:4747"),
     "server": _address("--server", "Address of hjepa serve, or of a relay.", "127.0.0.1:4747"),
     "key": Input(
@@ -308,7 +306,9 @@ _WIRE = {
     "timeout_s": Input(
         _Seconds, "--timeout", "A device silent for so long is forgotten.", "SECONDS", default=10.0
     ),
-    "for_s": Input(_Seconds, "--for", "End after so long. Without it: when interrupted.", "SECONDS"),
+    "for_s": Input(
+        _Seconds, "--for", "End after so long. Without it: when interrupted.", "SECONDS"
+    ),
     "number": Input(
         Annotated[int, Meta(ge=0, le=2**32 - 1)],
         "--number",
@@ -392,8 +392,11 @@ _WIRE = {
     ),
 }
 _LINKS = {
-    f"{way}_{name}": Input(kind, f"--{way}link-{name.replace('_', '-')}", text, metavar, panel=panel,
-                           default=default)
+    f"{way}_{name}": Input(
+        *(kind, f"--{way}link-{name.replace('_', '-')}", text, metavar),
+        default=default,
+        panel=panel,
+    )
     for way, panel in (("up", UPLINK), ("down", DOWNLINK))
     for name, kind, text, metavar, default in (
         ("loss", _Share, "Share of datagrams that are lost.", "SHARE", 0.0),
@@ -411,7 +414,7 @@ _LINKS = {
         ),
         ("trace", Path, "A recorded link; a line per datagram: MS or lost.", "FILE", None),
     )
-}  # fmt: skip
+}
 _SETTINGS = {
     "preset": Input(
         str,

@@ -48,8 +48,10 @@ from hjepa_cli.wire.bench import (
     MOST_MISSING,
     BenchOutcome,
     Fleet,
-    lockstep as in_lockstep,
     real_time,
+)
+from hjepa_cli.wire.bench import (
+    lockstep as in_lockstep,
 )
 from hjepa_cli.wire.bundle import Bundle, open_bundle
 from hjepa_cli.wire.controller import Controller
@@ -107,8 +109,14 @@ def run(
     check_plant(bundle, settings)
     path = zoo.resolve_model(checkpoint) if checkpoint else checkpoint_of(bundle)
     flags = {
-        **{"devices": devices, "steps": steps, "lockstep": lockstep, "period_ms": period_ms},
-        **{"gap_steps": gap_steps, "delivery": delivery, "harm": harm, "backend": backend},
+        "devices": devices,
+        "steps": steps,
+        "lockstep": lockstep,
+        "period_ms": period_ms,
+        "gap_steps": gap_steps,
+        "delivery": delivery,
+        "harm": harm,
+        "backend": backend,
     }
     inputs = {
         "model": describe_input(model, bundle.digest.hex()),
@@ -158,16 +166,21 @@ def run(
         states = np.empty_like(wired.states)
         with screen.progress("simulate", steps, "steps") as bar:
             planner = Exported(runtime, kind.action_shape) if lockstep else in_torch(bundle, path)
-            score = simulated(
-                runtime, planner, moved, camera, draws, sent, states, bar.advance
-            )
+            score = simulated(runtime, planner, moved, camera, draws, sent, states, bar.advance)
         result = compared(settings, wired, score, states, kind.state_names)
         result |= {
-            **{"model": model, "checkpoint": path, "method": bundle.manifest["method"]},
-            **{"plant": bundle.plant, "seed": settings.seed, **flags},
-            **{"period_ms": None if lockstep else 1e3 * period_s, "skipped_strides": skipped},
-            **{"downlink_loss": protocol_.downlink_loss, "delay_steps": protocol_.delay_steps},
-            **{"jitter_steps": protocol_.jitter_steps, "trace": trace},
+            "model": model,
+            "checkpoint": path,
+            "method": bundle.manifest["method"],
+            "plant": bundle.plant,
+            "seed": settings.seed,
+            **flags,
+            "period_ms": None if lockstep else 1e3 * period_s,
+            "skipped_strides": skipped,
+            "downlink_loss": protocol_.downlink_loss,
+            "delay_steps": protocol_.delay_steps,
+            "jitter_steps": protocol_.jitter_steps,
+            "trace": trace,
         }
         show(screen, result)
         screen.say(f"written: {record.directory}")

@@ -74,7 +74,9 @@ def run(
         def simulated() -> Camera:
             moved = actual_plant(settings.plant, settings.conditions)
             seen = actual_camera(settings.plant, settings.conditions, settings.seed)
-            plants.append(SimulatedPlant(moved, seen, settings.protocol, settings.seed, FIRST_DEVICE))
+            plants.append(
+                SimulatedPlant(moved, seen, settings.protocol, settings.seed, FIRST_DEVICE)
+            )
             return plants[0]
 
         opened_camera = open_camera(camera, parse_crop(crop), simulated)
@@ -95,7 +97,9 @@ def run(
             watchdog_steps=round(watchdog_ms / 1e3 / bundle.step_s),
         )
         runtime.warm_up("encoder" if precision == "fp32" else "encoder-int8", "actor")
-        rule = EverySteps(gap_steps) if innovation is None else OnInnovation(innovation, longest_steps)
+        rule = (
+            EverySteps(gap_steps) if innovation is None else OnInnovation(innovation, longest_steps)
+        )
         drive = Drive(device, watched, acts, runtime, rule, opened, where, screen.say)
         screen.say(f"device {device.number}, plant {bundle.plant}, server {written(where)}")
         try:

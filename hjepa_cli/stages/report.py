@@ -24,7 +24,7 @@ Result = dict[str, Any]
 Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
-STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale")
+STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale", "bench-link")
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 SMOKE = "smoke"
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
@@ -266,8 +266,17 @@ def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Pat
     return {"devices": (caption, figures.scale_figure(result))}
 
 
+def wire_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+    """Draw how late answers came and where forces came from."""
+    from hjepa_cli.output import figures
+
+    caption = "Control steps from a picture to the first force that answers it; who drove"
+    return {"wire": (caption, figures.wire_figure(result))}
+
+
 FIGURES: dict[str, Callable[..., Figures]] = {
     **dict.fromkeys(("train-encoder", "train-hierarchy", "train-reflex"), training_figures),
     "eval": eval_figures,
     "scale": scale_figures,
+    "bench-link": wire_figures,
 }

@@ -11,7 +11,8 @@ from typing import Any
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.dashboard import Dashboard
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.wire import auth, metrics as prometheus
+from hjepa_cli.wire import auth
+from hjepa_cli.wire import metrics as prometheus
 from hjepa_cli.wire.bundle import open_bundle
 from hjepa_cli.wire.controller import Controller
 from hjepa_cli.wire.runtime import Runtime
@@ -54,9 +55,7 @@ def run(
     bundle = open_bundle(model)
     runtime = Runtime(bundle, backend)
     runtime.warm_up("planner", "coarse", "fine")
-    controller = Controller(
-        bundle, runtime, secret, most_devices=max_devices, timeout_s=timeout_s
-    )
+    controller = Controller(bundle, runtime, secret, most_devices=max_devices, timeout_s=timeout_s)
     latest: dict[str, Any] = snapshot(controller, {}, time.monotonic())
     with contextlib.ExitStack() as open_doors:
         opened = open_doors.enter_context(contextlib.closing(open_socket(address)))

@@ -206,7 +206,7 @@ def lockstep(
 
     Datagrams up take as many steps as ``link`` says.
     """
-    steps, count = fleet.states.shape[:2]
+    steps = len(fleet.states)
     period_s, started_s = fleet.devices[0].period_s, time.monotonic()
     flying: dict[int, list[bytes]] = {}
     for k in range(steps):

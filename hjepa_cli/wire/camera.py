@@ -210,4 +210,3 @@ def open_camera(name: str, crop: Crop | None, simulated: Callable[[], Camera]) -
 def _endless(paths: list[Path]) -> Iterator[Path]:
     while True:
         yield from paths
-

@@ -411,9 +411,9 @@ class Controller:
             self._queue(session)
         sessions = due[: BUCKETS[-1]]
         for session in sessions:
-            present = session.clock.step(now_s)
-            if session.planned < present:
-                self._skip(session, present)
+            arrival = session.clock.step(now_s) + session.delay_steps()
+            if session.planned < arrival:
+                self._skip(session, arrival)
         return self._plan(sessions) if sessions else []
 
     def _take_due(self, heap: list[tuple[float, int, Session]], now_s: float) -> list[Session]:
@@ -433,13 +433,14 @@ class Controller:
     def _queue(self, session: Session) -> None:
         """Note when a device's next stride is due: some steps before it needs it."""
         faded = session.planned - session.base > FADED_STEPS
-        when_s = session.clock.time_s(session.planned - self._lead)
+        ahead = self._lead + session.delay_steps()
+        when_s = session.clock.time_s(session.planned - ahead)
         session.ticket = next(self._tickets)  # older ones in the heaps are void
         heapq.heappush(self._faded if faded else self._due, (when_s, session.ticket, session))
 
-    def _skip(self, session: Session, present: int) -> None:
-        """Move a device's embedding over whole strides that are past; it held its last force."""
-        strides = (present - session.planned) // self.bundle.stride
+    def _skip(self, session: Session, arrival: int) -> None:
+        """Move an embedding over whole strides that are past at arrival; the force was held."""
+        strides = (arrival - session.planned) // self.bundle.stride
         if not strides or session.z is None:
             return
         self.counts["skipped_strides"] += strides

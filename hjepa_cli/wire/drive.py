@@ -153,9 +153,14 @@ class Drive:
         self.longest_local_steps = max(self.longest_local_steps, self._local_steps)
         silent_s = self._device.silent * self._device.period_s
         stopped = source == protocol.ZERO
-        if stopped or (stop_after_s is not None and source == protocol.LOCAL
-                       and self._local_steps * self._device.period_s >= stop_after_s):
-            what = "there is no actor on the device" if stopped else f"--stop-after {stop_after_s:g}"
+        if stopped or (
+            stop_after_s is not None
+            and source == protocol.LOCAL
+            and self._local_steps * self._device.period_s >= stop_after_s
+        ):
+            what = (
+                "there is no actor on the device" if stopped else f"--stop-after {stop_after_s:g}"
+            )
             since = f"for {silent_s:.3g} s" if self._device.silent < protocol.NO_STEP else "so far"
             raise Unavailable(
                 f"no forces from {written(self._server)} {since}, and {what}: stopped at 0 N",
@@ -219,5 +224,7 @@ def refusal(device: Device, server: Any) -> HjepaError:
             hint="install the same hjepa on both sides",
         )
     if device.refused == protocol.FULL:
-        return Unavailable(f"{where} serves as many devices as it may", hint="--max-devices N there")
+        return Unavailable(
+            f"{where} serves as many devices as it may", hint="--max-devices N there"
+        )
     return DataError(f"{where} refuses the sizes of this model's embeddings or forces")

@@ -249,7 +249,10 @@ def _answer(data: bytes) -> Answer:
 def _embedding(data: bytes) -> Embedding:
     if len(data) < _EMBEDDING.size:
         raise Malformed("length")
-    count, axes = data[_EMBEDDING.size - 4] + 256 * data[_EMBEDDING.size - 3], data[_EMBEDDING.size - 2]
+    count, axes = (
+        data[_EMBEDDING.size - 4] + 256 * data[_EMBEDDING.size - 3],
+        data[_EMBEDDING.size - 2],
+    )
     found = _unpack(_EMBEDDING, data, 4 * axes + count)
     _, _, _, device, step, capture_age, force_age, source, *rest = found
     number, answered, lag_steps, scale, _, _, reserved = rest
@@ -270,9 +273,7 @@ def _forces(data: bytes) -> Forces:
     steps, axes = data[20], data[21]
     if not 0 < steps * axes <= MOST_FORCES:
         raise Malformed("sizes")
-    _, _, _, device, counter, base, first, _, _, reserved = _unpack(
-        _FORCES, data, 4 * steps * axes
-    )
+    _, _, _, device, counter, base, first, _, _, reserved = _unpack(_FORCES, data, 4 * steps * axes)
     _zero(reserved)
     if first + steps > NO_STEP or base > first:
         raise Malformed("steps")

@@ -61,7 +61,7 @@ class Trace:
                 delay_ms = float("nan") if word == LOST else float(word)
             except ValueError:
                 delay_ms = -1.0
-            if delay_ms < 0 or delay_ms == float("inf"):
+            if word != LOST and not 0 <= delay_ms < float("inf"):
                 raise DataError(
                     f"{path}, line {number}: '{word}'; expected a delay in milliseconds, or {LOST}"
                 )
@@ -95,7 +95,7 @@ class Impairment:
         burst: mean number of datagrams that a burst of losses lasts; 1: they are independent.
             A Gilbert-Elliott link of two states, one of which loses all (Gilbert 1960).
         delay_ms: that all take.
-        jitter_ms: up to so much more, evenly; what is overtaken comes later, as it was sent.
+        jitter_ms: up to so much more, evenly; some then overtake others.
         reorder: share of datagrams that are passed on without any delay, before others.
         duplicate: share that come twice.
         rate_kbps: what passes in a second; more waits, for a quarter of a second at most.

@@ -132,9 +132,7 @@ def _openvino(data: bytes, name: str) -> Network:
         rows = len(inputs[0])
         if rows not in compiled:
             model = core.read_model(data)
-            model.reshape(
-                {port: [rows, *port.partial_shape[1:]] for port in model.inputs}
-            )
+            model.reshape({port: [rows, *port.partial_shape[1:]] for port in model.inputs})
             compiled[rows] = core.compile_model(model, "CPU", options).create_infer_request()
         outputs = compiled[rows].infer(dict(enumerate(inputs)), share_inputs=True)
         return [np.array(outputs[port]) for port in outputs]

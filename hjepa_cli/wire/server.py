@@ -106,22 +106,24 @@ class Server:
         self._report, self._say = report, say
         self._before: Counter[str] = Counter()
         self._lines: dict[str, int] = {}
+        self._next_s = time.monotonic() + SECOND_S
         controller.say = self._note
 
     def run(self, until_s: float = float("inf")) -> None:
         """Serve until a time of the monotonic clock, or an interruption; then say goodbye."""
-        next_s = time.monotonic() + SECOND_S
         try:
             while (now_s := time.monotonic()) < until_s:
                 self._receive(now_s)
                 if outgoing := self._controller.work(time.monotonic()):
                     self._send(outgoing)
                     self._controller.sent(time.monotonic())
-                if now_s >= next_s:
-                    next_s = now_s + SECOND_S
+                if now_s >= self._next_s:
+                    self._next_s = now_s + SECOND_S
                     self._each_second(now_s)
                 if not outgoing:
-                    wait_s = min(self._controller.due_s(now_s), next_s - now_s, until_s - now_s)
+                    wait_s = min(
+                        self._controller.due_s(now_s), self._next_s - now_s, until_s - now_s
+                    )
                     select.select([self._socket], [], [], max(wait_s, 0.0))
         finally:
             self._send(self._controller.farewell())

@@ -51,8 +51,13 @@ class LinearRuntime:
 
 def bundle(plant="linear", digest=b"d" * 32):
     manifest = {
-        **{"plant": plant, "embedding": SIZE, "frames": 2, "action_shape": []},
-        **{"stride": STRIDE, "force_limit_n": 1000.0, "step_s": 0.001},
+        "plant": plant,
+        "embedding": SIZE,
+        "frames": 2,
+        "action_shape": [],
+        "stride": STRIDE,
+        "force_limit_n": 1000.0,
+        "step_s": 0.001,
     }
     return Bundle(Path("."), manifest, digest)
 

@@ -127,7 +127,7 @@ def test_a_recorded_session_proves_nothing_to_a_new_server():
 
 def test_a_hello_alone_takes_nobodys_place():
     """A session goes on until a newer one has proved itself."""
-    server, one, *_ = ready()
+    server, *_ = ready()
     before = server.sessions[1]
     again = linear.device(1)
     linear.connect(server, again, now_s=0.5)
@@ -244,7 +244,7 @@ def test_one_device_cannot_take_more_than_its_allowance():
 
 
 def test_behind_schedule_it_skips_what_is_past():
-    server, one, *_ = ready()
+    server, *_ = ready()
     planned = server.sessions[1].planned
     outgoing = linear.settle(server, 4.0)  # 400 steps later
     skipped = server.counts["skipped_strides"]
@@ -255,7 +255,7 @@ def test_behind_schedule_it_skips_what_is_past():
 
 
 def test_silent_devices_are_forgotten_and_memory_is_bounded():
-    server, one, *_ = ready()
+    server, *_ = ready()
     server.tidy(9.0)
     assert server.sessions
     server.tidy(11.0)
@@ -310,8 +310,7 @@ def play(one, steps):
 
 
 def test_silence_holds_then_the_actor_on_the_device_drives():
-    server, one, _, answers = ready()
-    actor_n = np.array([7.0], np.float32)
+    server, actor_n = linear.controller(), np.array([7.0], np.float32)
     one = linear.device(1, actor=lambda: actor_n, watchdog_steps=40)
     linear.connect(server, one)
     server.receive(one.embed(0, np.ones(linear.SIZE, np.float32)), 1, 0.0)
@@ -321,9 +320,7 @@ def test_silence_holds_then_the_actor_on_the_device_drives():
     planned = sources.count(protocol.PLANNED)
     assert planned >= controllers.LEAD_STEPS
     assert sources == (
-        [protocol.PLANNED] * planned
-        + [protocol.HELD] * (40 - planned)
-        + [protocol.LOCAL] * 160
+        [protocol.PLANNED] * planned + [protocol.HELD] * (40 - planned) + [protocol.LOCAL] * 160
     )
     assert one.play(200).forces_n == 7.0
 

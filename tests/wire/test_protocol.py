@@ -143,7 +143,11 @@ def test_the_tag_is_hmac_sha256_of_rfc_4231():
 
 def test_session_keys_differ_by_every_part():
     parts = [(KEY, 1, b"a" * 8, b"b" * 8), (KEY, 2, b"a" * 8, b"b" * 8)]
-    parts += [(KEY, 1, b"c" * 8, b"b" * 8), (KEY, 1, b"a" * 8, b"c" * 8), (bytes(32), *parts[0][1:])]
+    parts += [
+        (KEY, 1, b"c" * 8, b"b" * 8),
+        (KEY, 1, b"a" * 8, b"c" * 8),
+        (bytes(32), *parts[0][1:]),
+    ]
     assert len({auth.session_key(*one) for one in parts}) == len(parts)
 
 
