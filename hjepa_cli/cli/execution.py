@@ -6,7 +6,7 @@ Imports nothing heavy; see :mod:`hjepa_cli.cli.commands`.
 import inspect
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from hjepa_cli.cli.commands import Command, Given
 from hjepa_cli.compute import torchrun
@@ -29,6 +29,7 @@ def execute(command: Command, given: Given) -> None:
     with _guard(screen):
         del given["plugin"]  # loaded before the commands were listed
         dry_run, _ = given.pop("dry_run", False), given.pop("debug")
+        parallel = "workers" in given
         workers, cluster = given.pop("workers", None), given.pop("cluster", None)
         if command.prepare is not None:
             command.prepare(given)
@@ -40,9 +41,7 @@ def execute(command: Command, given: Given) -> None:
             wanted = inspect.signature(plan).parameters.keys() & inputs.keys()
             plan(**{name: inputs[name] for name in wanted}).show(screen)
             return
-        from hjepa_cli.compute.executors import placed
-
-        with placed(workers, cluster):
+        with _placed(workers, cluster) if parallel else nullcontext():
             result = command.run(**inputs)
         if torchrun.follows():
             return
@@ -50,6 +49,13 @@ def execute(command: Command, given: Given) -> None:
             screen.emit(result)
         elif screen.quiet and command.product and (made := result[command.product]) is not None:
             screen.result(str(made))  # otherwise the stage has said where it is
+
+
+def _placed(workers: int | None, cluster: str | None) -> AbstractContextManager[None]:
+    """Place parallel work; a command that has none does not import what it takes."""
+    from hjepa_cli.compute.executors import placed
+
+    return placed(workers, cluster)
 
 
 def _settings(command: Command, given: Given) -> Given:

@@ -7,6 +7,7 @@ up; where it does not, a score says nothing about the wire and is not reported.
 """
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -95,7 +96,7 @@ class Fleet:
                 first_number + i,
                 key,
                 period_s,
-                actor=(lambda i=i: self._local_n[i]) if local else None,
+                actor=functools.partial(self._local_n.__getitem__, i) if local else None,
                 watchdog_steps=watchdog_steps,
             )
             for i in range(count)
@@ -157,13 +158,13 @@ class Fleet:
             mask = np.zeros(len(self.devices), bool)
             mask[needy] = True
             forces_n = self._runtime.act(self._runtime.encode(self._look(mask)))
-            self._local_n = dict(zip(needy, forces_n, strict=True))
+            self._local_n.update(zip(needy, forces_n, strict=True))
         self.states[k] = self.plants.states
         played = [device.play(k) for device in self.devices]
         self.missing += int((~self._offered[:, k]).sum())
-        forces_n = np.stack([one.forces_n for one in played]).astype(np.float64)
-        shape = self.plants.plant.action_shape
-        return self.plants.move(forces_n.reshape(len(played), *shape))
+        forces_n = np.stack([one.forces_n for one in played])
+        shape = (len(played), *self.plants.plant.action_shape)
+        return self.plants.move(np.asarray(forces_n, np.float64).reshape(shape))
 
     def outcome(self, seconds: float) -> BenchOutcome:
         """Return what was measured."""

@@ -71,8 +71,8 @@ class Bundle:
         """Return the plant's control step."""
         return float(self.manifest["step_s"])
 
-    def network(self, name: str) -> bytes:
-        """Return a network's bytes after checking them against the manifest.
+    def network(self, name: str) -> Path:
+        """Return a network's file after checking it against the manifest.
 
         Raises:
             DataError: they are others, or there is no such network.
@@ -84,7 +84,7 @@ class Bundle:
         data = files.read_bytes(path, limit=_LIMIT_BYTES)
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
             raise DataError(f"{path} is not the file that {MANIFEST} names", hint=_again(self))
-        return data
+        return path
 
     def verify(self) -> None:
         """Check every network. Raises as :meth:`network`."""

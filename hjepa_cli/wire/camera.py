@@ -172,7 +172,7 @@ def fitted(picture: Pixels, crop: Crop | None) -> Pixels:
             "that height"
         )
     blocks = part.reshape(HEIGHT_PX, scale, WIDTH_PX, scale, 3).astype(np.float32)
-    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+    return np.asarray(np.rint(blocks.mean(axis=(1, 3))), np.uint8)
 
 
 def parse_crop(text: str | None) -> Crop | None:

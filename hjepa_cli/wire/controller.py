@@ -128,8 +128,9 @@ class Session:
         """Take what a datagram says besides its embedding."""
         guessed = self.answers == 0
         if self.embeddings:
-            self.lost += (packet.count - self._count - 1) % 256
-        self._count, self.embeddings, self.source = packet.count, self.embeddings + 1, packet.source
+            self.lost += (packet.number - self._count - 1) % 256
+        self._count, self.embeddings = packet.number, self.embeddings + 1
+        self.source = packet.source
         late = 0
         if packet.answered != protocol.NO_STEP:
             if packet.answered not in self._lateness:
@@ -154,7 +155,7 @@ class Session:
     def forces_n(self, first: int, count: int) -> Singles:
         """Return the forces [count, m] of the steps from ``first`` on; the last one is held."""
         steps = np.minimum(first + np.arange(count), max(self.planned - 1, 0))
-        return self._forces_n[steps % REMEMBERED_STEPS]
+        return np.asarray(self._forces_n[steps % REMEMBERED_STEPS])
 
     @property
     def ends_s(self) -> float:
@@ -334,8 +335,9 @@ class Controller:
         return []
 
     def _forget(self, device: int) -> None:
-        for among in (self.sessions, self._pending, self._fresh):
-            among.pop(device, None)  # type: ignore[attr-defined]
+        self.sessions.pop(device, None)
+        self._pending.pop(device, None)
+        self._fresh.pop(device, None)
 
     # -- work -----------------------------------------------------------------------------------
 

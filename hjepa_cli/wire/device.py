@@ -127,9 +127,17 @@ class Device:
         scale, codes = protocol.encode_int8(z)
         self._sent, self._sent_step = self._sent + 1, step
         packet = Embedding(
-            *(self.number, step, step - (step if capture is None else capture)),
-            *(self._last.forces_n, min(max(step - self._last_step, 0), 255), self._last.source),
-            *(self._sent % 256, self._answered, min(self._lag, 65_535), scale, codes),
+            device=self.number,
+            step=step,
+            capture_age=step - (step if capture is None else capture),
+            forces_n=self._last.forces_n,
+            force_age=min(max(step - self._last_step, 0), 255),
+            source=self._last.source,
+            number=self._sent % 256,
+            answered=self._answered,
+            lag_steps=min(self._lag, 65_535),
+            scale=scale,
+            codes=codes,
         )
         return auth.tagged(self._session, protocol.pack_embedding(packet))
 

@@ -8,7 +8,6 @@ that are the velocity (docs/LOG.md has what their rounding costs).
 
 import contextlib
 import hashlib
-import io
 import logging
 import math
 import os
@@ -54,6 +53,8 @@ CALIBRATION, CHECKED = 512, 256  # frame pairs, of trajectories 0 … and of hel
 FLOAT_CONVOLUTIONS = 7  # of the int8 encoder: the stem, and three of each of two stages
 LARGEST_ERROR = 1e-5  # of z, and of forces ÷ limit, against torch
 OURS = {MANIFEST, CHECK, *(f"{name}.onnx" for name in NETWORKS)}
+Inputs = dict[str, tuple[tuple[int, ...], torch.dtype]]
+"""Shape of a row and type of each input, by name."""
 LARGEST_INT8 = {"rms_z": 0.015, "rms_force_n": 0.05}
 
 
@@ -86,11 +87,12 @@ class _Plan(nn.Module):
         self.again = model.architecture["stride_actions"] == "all"
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        networks, act = self.networks, self.networks["actor"].act
+        networks: Any = self.networks
+        act = networks["actor"].act
         if self.strides:
-            levels = (networks[name] for name in ("high", "medium", "low"))
+            high, medium, low = (networks[name] for name in ("high", "medium", "low"))
             actions, _, z_next = plan_stride(
-                act, *levels, z, self.strides, recompute_waypoint=self.again
+                act, high, medium, low, z, self.strides, recompute_waypoint=self.again
             )
         else:
             actions = hold(act(z), self.stride)
@@ -115,7 +117,8 @@ class _Act(nn.Module):
 
     def __init__(self, model: Model) -> None:
         super().__init__()
-        self.actor, self.force_limit_n = model.networks["actor"], model.force_limit_n
+        self.actor: Any = model.networks["actor"]
+        self.force_limit_n = model.force_limit_n
 
     def forward(self, z: Tensor) -> Tensor:
         acted: Tensor = self.force_limit_n * self.actor.act(z)
@@ -153,7 +156,7 @@ def exported_method(model: Model, method: str | None) -> str:
     return method or able[0]
 
 
-def networks_of(model: Model, method: str) -> dict[str, tuple[nn.Module, dict[str, tuple], tuple]]:
+def networks_of(model: Model, method: str) -> dict[str, tuple[nn.Module, Inputs, tuple[str, ...]]]:
     """Return the networks to export: module, inputs (name → shape and dtype) and output names."""
     planner: Any = planner_of(model, method)
     assert isinstance(planner, Hierarchy | OnePredictor)
@@ -195,13 +198,13 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
         require(module, f"export needs {module}", "export")
     model = load_fp32(path)
     method = exported_method(model, method)
-    kind, entries = plant(model.plant_name), {}
+    kind, entries = plant(model.plant_name), dict[str, Any]()
     files.make_directory(directory)
     files.refuse_foreign(directory, "exported model", OURS.__contains__)
     with files.writing(directory):
         (directory / MANIFEST).unlink(missing_ok=True)  # a half-written bundle has none
-    for name, (module, inputs, outputs) in networks_of(model, method).items():
-        data = _onnx(module, inputs, outputs)
+    for name, (network, inputs, outputs) in networks_of(model, method).items():
+        data = _onnx(network, inputs, outputs)
         entries[name] = _write(directory, name, data, inputs, outputs)
         if name == "encoder":
             quantised = _int8(data, pictures(model, "train", CALIBRATION))
@@ -229,7 +232,7 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
 
 
 def _write(
-    directory: Path, name: str, data: bytes, inputs: dict[str, tuple], outputs: tuple
+    directory: Path, name: str, data: bytes, inputs: Inputs, outputs: tuple[str, ...]
 ) -> dict[str, Any]:
     files.write_bytes(directory / f"{name}.onnx", data)
     described = {
@@ -245,7 +248,7 @@ def _write(
     }
 
 
-def _onnx(module: nn.Module, inputs: dict[str, tuple], outputs: tuple) -> bytes:
+def _onnx(module: nn.Module, inputs: Inputs, outputs: tuple[str, ...]) -> bytes:
     """Return a module as ONNX, its first axis of any length."""
     examples = tuple(torch.zeros(3, *shape, dtype=dtype) for shape, dtype in inputs.values())
     free = torch.export.Dim("n", min=1, max=2**16)
@@ -259,9 +262,9 @@ def _onnx(module: nn.Module, inputs: dict[str, tuple], outputs: tuple) -> bytes:
             dynamo=True,
             verbose=False,
         )
-        buffer = io.BytesIO()
-        program.save(buffer)
-    return buffer.getvalue()
+    assert program is not None
+    data: bytes = program.model_proto.SerializeToString()
+    return data
 
 
 def _int8(data: bytes, frames: Pixels) -> bytes:
@@ -274,11 +277,11 @@ def _int8(data: bytes, frames: Pixels) -> bytes:
         quantize_static,
     )
 
-    class Pictures(CalibrationDataReader):
+    class Pictures(CalibrationDataReader):  # type: ignore[misc]
         def __init__(self) -> None:
             self._parts = iter(np.array_split(frames, max(len(frames) // 32, 1)))
 
-        def get_next(self) -> dict[str, Pixels] | None:  # type: ignore[override]
+        def get_next(self) -> dict[str, Pixels] | None:
             part = next(self._parts, None)
             return None if part is None else {"frames": part}
 
@@ -354,7 +357,8 @@ def check(bundle: Bundle, path: Path, backend: str = "onnxruntime") -> dict[str,
             hint=f"hjepa export {path} --to {bundle.directory}",
         )
     bundle.verify()
-    planner, runtime, worst = planner_of(model, method), Runtime(bundle, backend), {}
+    planner, runtime = planner_of(model, method), Runtime(bundle, backend)
+    worst: dict[str, float] = {}
     frames, most = pictures(model, "clean", CHECKED), bundle.stride
     z = model.encode(frames)
     with torch.inference_mode():

@@ -52,7 +52,7 @@ def exposed(
             yield events
 
     registry = CollectorRegistry()
-    registry.register(Snapshots())  # type: ignore[arg-type]
+    registry.register(Snapshots())
     try:
         server, thread = start_http_server(port, host, registry)
     except OSError as error:

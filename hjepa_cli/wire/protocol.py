@@ -7,7 +7,8 @@ exactly that of its type and counts, or that holds what no sender of ours writes
 """
 
 import struct
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +87,7 @@ class Embedding(NamedTuple):
         forces_n: the last force that it applied [m].
         force_age: steps since the step that force was for.
         source: where it came from, as :data:`PLANNED`.
-        count: of the session's embeddings, modulo 256: a gap in it is what was lost.
+        number: of the session's embeddings, modulo 256: a gap in it is what was lost.
         answered: capture step of the newest embedding that forces have come back for, or
             :data:`NO_STEP`.
         lag_steps: steps from that capture to the first force; without one, of the hello's answer.
@@ -99,7 +100,7 @@ class Embedding(NamedTuple):
     forces_n: NDArray[np.float32]
     force_age: int
     source: int
-    count: int
+    number: int
     answered: int
     lag_steps: int
     scale: float
@@ -158,7 +159,7 @@ def pack_embedding(m: Embedding) -> bytes:
     """Return an embedding's datagram without its tag."""
     head = _EMBEDDING.pack(
         *(MAGIC, VERSION, EMBEDDING, m.device, m.step, m.capture_age, m.force_age, m.source),
-        *(m.count, m.answered, m.lag_steps, m.scale, len(m.codes), len(m.forces_n), 0),
+        *(m.number, m.answered, m.lag_steps, m.scale, len(m.codes), len(m.forces_n), 0),
     )
     return head + m.forces_n.astype("<f4").tobytes() + m.codes.tobytes()
 
@@ -206,7 +207,7 @@ def parse(data: bytes) -> Message:
     return _PARSERS[kind](data)
 
 
-def _unpack(layout: struct.Struct, data: bytes, further_bytes: int = 0) -> tuple:
+def _unpack(layout: struct.Struct, data: bytes, further_bytes: int = 0) -> tuple[Any, ...]:
     if len(data) != layout.size + further_bytes + TAG_BYTES:
         raise Malformed("length")
     return layout.unpack_from(data)
@@ -287,7 +288,13 @@ def _bye(data: bytes) -> Bye:
     return Bye(device)
 
 
-_PARSERS = {HELLO: _hello, ANSWER: _answer, EMBEDDING: _embedding, FORCES: _forces, BYE: _bye}
+_PARSERS: dict[int, Callable[[bytes], Message]] = {
+    HELLO: _hello,
+    ANSWER: _answer,
+    EMBEDDING: _embedding,
+    FORCES: _forces,
+    BYE: _bye,
+}
 
 
 def encode_int8(z: NDArray[np.float32]) -> tuple[float, NDArray[np.int8]]:

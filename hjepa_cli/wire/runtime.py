@@ -6,6 +6,7 @@ up to the next of :data:`~hjepa_cli.wire.bundle.BUCKETS`.
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -108,21 +109,21 @@ def _filled(values: NDArray[Any], rows: int) -> NDArray[Any]:
     return filled
 
 
-def _onnxruntime(data: bytes, name: str) -> Network:
+def _onnxruntime(path: Path, name: str) -> Network:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:
-        session = onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(path, options, ["CPUExecutionProvider"])
     except Exception as error:  # its own classes have no common base
         raise DataError(f"onnxruntime cannot load network '{name}': {_first(error)}") from None
     names = [one.name for one in session.get_inputs()]
     return lambda *inputs: session.run(None, dict(zip(names, inputs, strict=True)))
 
 
-def _openvino(data: bytes, name: str) -> Network:
+def _openvino(path: Path, name: str) -> Network:
     import openvino
 
     core, compiled = openvino.Core(), {}
@@ -131,14 +132,14 @@ def _openvino(data: bytes, name: str) -> Network:
     def run(*inputs: NDArray[Any]) -> list[NDArray[Any]]:
         rows = len(inputs[0])
         if rows not in compiled:
-            model = core.read_model(data)
+            model = core.read_model(path)
             model.reshape({port: [rows, *port.partial_shape[1:]] for port in model.inputs})
             compiled[rows] = core.compile_model(model, "CPU", options).create_infer_request()
         outputs = compiled[rows].infer(dict(enumerate(inputs)), share_inputs=True)
         return [np.array(outputs[port]) for port in outputs]
 
     try:
-        core.read_model(data)
+        core.read_model(path)
     except Exception as error:
         raise DataError(f"openvino cannot load network '{name}': {_first(error)}") from None
     return run

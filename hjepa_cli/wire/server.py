@@ -60,7 +60,8 @@ def written(address: Any) -> str:
 
 def is_loopback(address: Any) -> bool:
     """Say whether only this machine can reach an address."""
-    return address[0].startswith("127.") or address[0] == "::1"
+    host = str(address[0])
+    return host.startswith("127.") or host == "::1"
 
 
 def open_socket(address: Address, flag: str = "--bind") -> socket.socket:
@@ -158,9 +159,8 @@ class Server:
             listed = ", ".join(f"{count} {name}" for name, count in bad.items())
             self._say(f"ignored in the last second: {listed} (a wrong key, or no device of ours)")
         if gained["skipped_strides"]:
-            self._say(
-                f"behind schedule: {gained['skipped_strides']} strides skipped in the last second"
-            )
+            skipped = gained["skipped_strides"]
+            self._say(f"behind schedule: {skipped} strides skipped in the last second")
         for line, count in self._lines.items():
             self._say(line if count == 1 else f"{line} ({count} times)")
         self._lines = {}
@@ -170,7 +170,7 @@ class Server:
 def snapshot(controller: Controller, gained: Mapping[str, int], now_s: float) -> dict[str, Any]:
     """Return what a server knows, plain: totals, what the last second brought, and devices."""
     waits_ms = 1e3 * np.array(controller.waited_s or [0.0])
-    rows = []
+    rows: list[dict[str, Any]] = []
     for number, session in controller.sessions.items():
         age = session.clock.step(now_s) - session.base if session.z is not None else None
         rows.append(

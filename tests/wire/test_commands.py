@@ -1,4 +1,4 @@
-"""The commands of the wire as a person types them: mistakes, and a real server with a real device."""
+"""The commands of the wire as a person types them: mistakes, a real server, a real device."""
 
 import contextlib
 import json

@@ -13,7 +13,6 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Floats, finite
 from hjepa_cli.core.plants.cartpole import camera
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
-from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.errors import UsageError
 
@@ -117,6 +116,8 @@ class CartPole:
     """
 
     def __init__(self, preset: CartPolePlant | str, *, seed: int | None = None) -> None:
+        from hjepa_cli.core.plants.cartpole.simulation import CartPoles  # pymunk, as plant.py does
+
         self._poles = CartPoles(cart_pole(preset), 1)
         self.plant = self._poles.plant
         if seed is not None:
