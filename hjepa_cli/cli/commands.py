@@ -123,8 +123,8 @@ def _one_rule(settings: Settings, given: Given) -> None:
 def _one_schedule(settings: Settings, given: Given) -> None:
     if given["delivery"] is not None and given["gap_steps"] != INPUTS["gap_steps:wire"].default:
         raise UsageError("--gap and --delivery are two kinds of uplink; give one of them")
-    if given["lockstep"] and (given["harm"] or given["period_ms"]):
-        raise UsageError("--lockstep counts time in steps: leave --period-ms and --harm out")
+    if given["lockstep"] and given["period_ms"]:
+        raise UsageError("--lockstep counts time in the plant's steps: leave --period-ms out")
 
 
 _LINK = tuple(

@@ -67,7 +67,7 @@ def table(found: Mapping[str, Any]) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    drawn = Table(*COLUMNS, title=Text(headline(found)), title_justify="left")
+    drawn = Table(*map(Text, COLUMNS), title=Text(headline(found)), title_justify="left")
     for one in found["listed"][:ROWS]:
         cells = (
             *(one["device"], one["age_steps"], one["lost"], f"{one['missed']}/{one['answers']}"),

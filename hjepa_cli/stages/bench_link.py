@@ -129,7 +129,7 @@ def run(
         torch.set_num_threads(1)
         protocol_ = dataclasses.replace(settings.protocol, warmup_steps=0, steps=steps)
         draws = Draws.make(protocol_, devices, settings.seed)
-        period_s = (period_ms or PERIOD_MS) / 1e3
+        period_s = kind.step_s if lockstep else (period_ms or PERIOD_MS) / 1e3
         sent = (
             gap_schedule(gap_steps, steps, devices)
             if delivery is None
@@ -152,9 +152,15 @@ def run(
         )
         with screen.progress("wire", steps, "steps") as bar:
             if lockstep:
-                controller = Controller(bundle, runtime, NO_KEY, most_devices=devices)
-                wired = in_lockstep(fleet, controller, link, bar.advance)
-                skipped = controller.counts["skipped_strides"]
+                servers = [
+                    Controller(bundle, runtime, NO_KEY, most_devices=devices) for _ in range(2)
+                ]
+                wired = in_lockstep(
+                    *(fleet, servers[0], link, bar.advance),
+                    silent=silence(steps, period_s, harm),
+                    restarted=servers[1] if harm == "kill" else None,
+                )
+                skipped = sum(one.counts["skipped_strides"] for one in servers)
             else:
                 wired, skipped = drive(fleet, model, backend, harm, bar.advance)
         if wired.missing > MOST_MISSING and harm is None:
@@ -168,6 +174,9 @@ def run(
             planner = Exported(runtime, kind.action_shape) if lockstep else in_torch(bundle, path)
             score = simulated(runtime, planner, moved, camera, draws, sent, states, bar.advance)
         result = compared(settings, wired, score, states, kind.state_names)
+        if harm is not None:
+            back = silence(steps, period_s, harm).stop
+            result["taken_up_after_s"] = max(wired.unplanned_until - back, 0) * period_s
         result |= {
             "model": model,
             "checkpoint": path,
@@ -295,6 +304,14 @@ def simulated(
     return outcome.score[0]
 
 
+def silence(steps: int, period_s: float, harm: str | None) -> range:
+    """Return the steps in which a server that is harmed says nothing, from the middle on."""
+    if harm is None:
+        return range(0)
+    middle = steps // 2
+    return range(middle, middle + round((KILLED_S if harm == "kill" else STOPPED_S) / period_s))
+
+
 def drive(
     fleet: Fleet, model: Path, backend: str, harm: str | None, tick: Callable[[], None]
 ) -> tuple[BenchOutcome, int]:
@@ -305,9 +322,8 @@ def drive(
         )
         servers = [things.enter_context(serving(model, backend, "127.0.0.1:0"))]
         address = servers[0].address
-        middle = fleet.states.shape[0] // 2
-        period_s = fleet.devices[0].period_s
-        again = middle + round((KILLED_S if harm == "kill" else STOPPED_S) / period_s)
+        silent = silence(len(fleet.states), fleet.devices[0].period_s, harm)
+        middle, again = silent.start, silent.stop
 
         def at_step(k: int) -> None:
             if harm == "kill" and k == middle:
@@ -385,6 +401,12 @@ def show(screen: Screen, result: dict[str, Any]) -> None:
             ["steps without a force", f"{100 * result['missing_share']:.3f} %"],
             ["answers after their step", f"{100 * result['late_answers_share']:.1f} %"],
             ["strides skipped", result["skipped_strides"]],
+            *(
+                [["all driven again after [s]", f"{result['taken_up_after_s']:.3f}"]]
+                if "taken_up_after_s" in result
+                else []
+            ),
+            ["devices that fell", f"{100 * result.get('fallen_share', float('nan')):.1f} %"],
             *(
                 [f"angles apart by, first {k} steps [rad]", f"{apart:.1e}"]
                 for k, apart in result.get("theta_difference_rad", {}).items()

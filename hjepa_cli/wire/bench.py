@@ -41,6 +41,7 @@ class BenchOutcome:
         late_answers: share of embeddings whose answer came after their step.
         ages: steps between capture and first force of the embeddings that were answered.
         sources: device-steps by where their force came from.
+        unplanned_until: step after the last one in which some device had no planned force.
         seconds: of the drive.
     """
 
@@ -50,6 +51,7 @@ class BenchOutcome:
     late_answers: float
     ages: dict[int, int]
     sources: dict[str, int]
+    unplanned_until: int
     seconds: float
 
 
@@ -104,7 +106,7 @@ class Fleet:
         self.states = np.empty((steps, count, len(plant.state_names)))
         self._offered = np.zeros((count, steps + protocol.MOST_FORCES), bool)
         self._captures: list[dict[int, int]] = [{} for _ in range(count)]
-        self.missing, self.late, self.ages = 0, 0, dict[int, int]()
+        self.missing, self.unplanned_until, self.ages = 0, 0, dict[int, int]()
 
     def upkeep(self, now_s: float) -> list[bytes]:
         """Return hellos that are due."""
@@ -162,6 +164,8 @@ class Fleet:
         self.states[k] = self.plants.states
         played = [device.play(k) for device in self.devices]
         self.missing += int((~self._offered[:, k]).sum())
+        if any(one.source != protocol.PLANNED for one in played):
+            self.unplanned_until = k + 1
         forces_n = np.stack([one.forces_n for one in played])
         shape = (len(played), *self.plants.plant.action_shape)
         return self.plants.move(np.asarray(forces_n, np.float64).reshape(shape))
@@ -181,6 +185,7 @@ class Fleet:
             late_answers=late / max(answers, 1),
             ages=dict(sorted(self.ages.items())),
             sources=sources,
+            unplanned_until=self.unplanned_until,
             seconds=seconds,
         )
 
@@ -202,14 +207,23 @@ def lockstep(
     controller: Controller,
     link: LinkDraws,
     tick: Callable[[], None] = lambda: None,
+    *,
+    silent: range = range(0),
+    restarted: Controller | None = None,
 ) -> BenchOutcome:
     """Drive a fleet with everything of a step done before the next; time is counted in steps.
 
-    Datagrams up take as many steps as ``link`` says.
+    Args:
+        fleet, controller: both ends.
+        link: tells how many steps datagrams up take.
+        tick: called after every step.
+        silent: steps in which the controller stands still. What comes in them waits for it,
+        restarted: or is lost, where another one takes its place.
     """
     steps = len(fleet.states)
     period_s, started_s = fleet.devices[0].period_s, time.monotonic()
     flying: dict[int, list[bytes]] = {}
+    waiting: list[bytes] = []
     for k in range(steps):
         now_s = k * period_s
 
@@ -217,8 +231,17 @@ def lockstep(
             for data, _ in outgoing:
                 fleet.take(data, k, now_s)
 
-        for hello in fleet.upkeep(now_s):
-            deliver(controller.receive(hello, None, now_s))
+        greetings = fleet.upkeep(now_s)
+        if k in silent:
+            waiting += [*greetings, *fleet.sense(k)]
+            fleet.play(k)
+            tick()
+            continue
+        if k == silent.stop and restarted is not None:
+            controller, waiting = restarted, []
+        for data in (*waiting, *greetings):
+            deliver(controller.receive(data, None, now_s))
+        waiting = []
         for data in fleet.sense(k):
             i = protocol.peek(data)[1] - fleet.devices[0].number
             extra = 0 if link.extra_steps is None else int(link.extra_steps[k, i])

@@ -53,7 +53,8 @@ class Drive:
         self._runtime, self._rule, self._say = runtime, rule, say
         self._socket, self._server = opened, server
         self._source = protocol.PLANNED
-        self._said_s = -np.inf
+        self._said_s: dict[str, float] = {}
+        self._late_s: list[float] = []
         self.sent = self.late_steps = 0
         self.longest_local_steps = self._local_steps = 0
 
@@ -94,8 +95,7 @@ class Drive:
             if (late_s := time.monotonic() - begins_s) > LATE_STEPS * period_s:
                 start_s += late_s
                 begins_s += late_s
-                self.late_steps += 1
-                self._say_seldom(f"step {k} begins {1e3 * late_s:.0f} ms late: it waits no longer")
+                self._begins_late(late_s)
             if not self._camera.read():
                 return
             self._send(device.upkeep(time.monotonic()))
@@ -146,8 +146,8 @@ class Drive:
             protocol.PLANNED: "the controller drives",
             protocol.LOCAL: "the controller is silent: the actor on the device drives",
         }
-        if source != self._source and source in names:
-            self._say_seldom(names[source])
+        if source != self._source and source in names and self._is_time("source"):
+            self._say(names[source])
             self._source = source
         self._local_steps = self._local_steps + 1 if source == protocol.LOCAL else 0
         self.longest_local_steps = max(self.longest_local_steps, self._local_steps)
@@ -201,11 +201,25 @@ class Drive:
                 return
             select.select([self._socket], [], [], left_s)
 
-    def _say_seldom(self, line: str) -> None:
-        """Print a line, one a second at most."""
-        if time.monotonic() - self._said_s >= 1.0:
-            self._said_s = time.monotonic()
-            self._say(line)
+    def _begins_late(self, late_s: float) -> None:
+        """Count a step that begins late, and tell of those of a second at once."""
+        self.late_steps += 1
+        self._late_s.append(late_s)
+        if self._is_time("late"):
+            worst_ms = 1e3 * max(self._late_s)
+            self._say(
+                f"{len(self._late_s)} steps began late, by up to {worst_ms:.0f} ms: this computer "
+                "is busy, or its clock has jumped; steps are counted from there"
+            )
+            self._late_s = []
+
+    def _is_time(self, subject: str) -> bool:
+        """Say whether a second has gone by since a subject was last talked of."""
+        now_s = time.monotonic()
+        if now_s - self._said_s.get(subject, -np.inf) < 1.0:
+            return False
+        self._said_s[subject] = now_s
+        return True
 
 
 def refusal(device: Device, server: Any) -> HjepaError:

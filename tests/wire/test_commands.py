@@ -53,7 +53,7 @@ def refused(shell, code, *arguments, says=()):
         (["link", "--uplink-loss", "0.9", "--uplink-burst", "2"], 2, ["bursts must last"]),
         (["link", "--uplink-trace", "nowhere"], 66, ["nowhere does not exist"]),
         (["bench-link", "--model", "nowhere"], 66, ["no exported model"]),
-        (["bench-link", "--model", "m", "--lockstep", "--harm", "kill"], 2, ["--lockstep"]),
+        (["bench-link", "--model", "m", "--lockstep", "--period-ms", "5"], 2, ["--lockstep"]),
     ],
 )
 def test_mistakes(shell, arguments, code, says):
