@@ -26,7 +26,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.drivers import planner_of
-from hjepa_cli.core.control.loop import Draws, delivery_schedule, gap_schedule, simulate
+from hjepa_cli.core.control.loop import Draws, LinkDraws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
 from hjepa_cli.core.plants.frames import frames_of
@@ -148,6 +148,7 @@ def run(
         fleet = Fleet(
             *(bundle, runtime, moved, camera, draws, sent, NO_KEY, period_s),
             local=harm is not None,
+            grace_steps=latest_steps(link),
             lost=link.lost,
         )
         with screen.progress("wire", steps, "steps") as bar:
@@ -302,6 +303,12 @@ def simulated(
     controller = StrideController(planner, draws.devices, action_shape=plant.action_shape)
     outcome = simulate(plant, draws, sent[None], controller, sense, tick=tick, watch=watch)
     return outcome.score[0]
+
+
+def latest_steps(link: LinkDraws) -> int:
+    """Return the steps that a datagram up takes at most."""
+    extra = 0 if link.extra_steps is None else int(link.extra_steps.max(initial=0))
+    return link.delay_steps + extra
 
 
 def silence(steps: int, period_s: float, harm: str | None) -> range:

@@ -66,6 +66,9 @@ class Fleet:
         key, period_s: as of :class:`~hjepa_cli.wire.device.Device`.
         local: whether the actor on a device drives it when the controller is silent.
         lost: whether a datagram with forces that comes in a step is lost [K, N].
+        watchdog_steps: as of a device.
+        grace_steps: before which no force can have come, as the link is late.
+        first_number: of the devices, which are counted from there.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class Fleet:
         local: bool = False,
         lost: Bools | None = None,
         watchdog_steps: int | None = None,
+        grace_steps: int = 0,
         first_number: int = 1,
     ) -> None:
         self.bundle, self._runtime, self._camera = bundle, runtime, camera
@@ -90,6 +94,7 @@ class Fleet:
         self.plants = ScoredPlants(
             plant, draws.initial, draws.mass_scale, iter(draws.noise), draws.warmup_steps
         )
+        self._grace_steps = grace_steps
         self._scored = steps - draws.warmup_steps
         self._local_n: dict[int, Singles] = {}
         self.devices = [
@@ -163,7 +168,8 @@ class Fleet:
             self._local_n.update(zip(needy, forces_n, strict=True))
         self.states[k] = self.plants.states
         played = [device.play(k) for device in self.devices]
-        self.missing += int((~self._offered[:, k]).sum())
+        if k >= self._grace_steps:
+            self.missing += int((~self._offered[:, k]).sum())
         if any(one.source != protocol.PLANNED for one in played):
             self.unplanned_until = k + 1
         forces_n = np.stack([one.forces_n for one in played])
@@ -224,6 +230,10 @@ def lockstep(
     period_s, started_s = fleet.devices[0].period_s, time.monotonic()
     flying: dict[int, list[bytes]] = {}
     waiting: list[bytes] = []
+    for i, device in enumerate(fleet.devices):  # taken up before, by a link as late as at first
+        hello_s = -flying_steps(link, 0, i) * period_s
+        for data, _ in controller.receive(device.upkeep(hello_s) or b"", None, hello_s):
+            fleet.take(data, 0, 0.0)
     for k in range(steps):
         now_s = k * period_s
 
@@ -244,8 +254,7 @@ def lockstep(
         waiting = []
         for data in fleet.sense(k):
             i = protocol.peek(data)[1] - fleet.devices[0].number
-            extra = 0 if link.extra_steps is None else int(link.extra_steps[k, i])
-            flying.setdefault(k + link.delay_steps + extra, []).append(data)
+            flying.setdefault(k + flying_steps(link, k, i), []).append(data)
         for data in flying.pop(k, []):
             deliver(controller.receive(data, None, now_s))
         while outgoing := controller.work(now_s):
@@ -253,6 +262,12 @@ def lockstep(
         fleet.play(k)
         tick()
     return fleet.outcome(time.monotonic() - started_s)
+
+
+def flying_steps(link: LinkDraws, k: int, i: int) -> int:
+    """Return the steps that a datagram takes which device i sends in step k."""
+    extra = 0 if link.extra_steps is None else int(link.extra_steps[k, i])
+    return link.delay_steps + extra
 
 
 def real_time(

@@ -117,9 +117,9 @@ def open_bundle(directory: Path) -> Bundle:
     bundle = Bundle(directory, manifest, hashlib.sha256(data).digest())
     try:
         networks, shape = manifest["networks"], manifest["action_shape"]
-        sizes = (bundle.embedding, bundle.frames, bundle.stride, bundle.axes)
+        sizes = [manifest[name] for name in ("embedding", "frames", "stride")]
         good = (
-            all(0 < size <= 65_535 for size in sizes)
+            all(type(size) is int and 0 < size <= 65_535 for size in sizes)
             and all(isinstance(axis, int) and axis > 0 for axis in shape)
             and bundle.force_limit_n > 0
             and bundle.step_s > 0

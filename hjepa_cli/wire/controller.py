@@ -27,10 +27,11 @@ from hjepa_cli.wire.protocol import Answer, Embedding, Forces, Hello
 from hjepa_cli.wire.runtime import Runtime, Singles
 
 WINDOW_STEPS = 16  # forces in a datagram: its stride's, and those of the strides before
+REPEATS = 7  # of an answer, one a step: what loses it loses the next datagram too, perhaps
 LEAD_STEPS = 12  # that forces are computed ahead of the device, at least
 REMEMBERED_STEPS = 512  # of the forces that were sent; no embedding may be older
 FADED_STEPS = 512  # since its newest embedding: then a device is served after all others
-CLOCK_DATAGRAMS = 4  # of whose arrivals the earliest tells how late the others are
+CLOCK_DATAGRAMS = 16  # of whose arrivals the earliest tells how late the others are
 GREETING = (200.0, 400.0)  # hellos a second of all strangers, and at once
 ALLOWANCE = (1.5, 32.0)  # datagrams per control step of a device, and at once
 PENDING = 4096  # sessions that have not been proved yet
@@ -77,10 +78,14 @@ class Clock:
         start_s = now_s - step * self.period_s
         late = round((start_s - min(self._starts_s, default=start_s)) / self.period_s)
         if late > LEAD_STEPS:  # so late that its clock has stood still, or ours has jumped
-            self._starts_s.clear()
+            self.forget()
             late = 0
         self._starts_s.append(start_s)
         return max(late, 0)
+
+    def forget(self) -> None:
+        """Start anew: the device's steps have stood still for a while."""
+        self._starts_s.clear()
 
     def step(self, now_s: float) -> int:
         """Return the step that the device is in by now."""
@@ -136,6 +141,8 @@ class Session:
             if packet.answered not in self._lateness:
                 return
             late = self._lateness.pop(packet.answered)
+            if packet.lag_steps < late:  # it cannot have been that late
+                self.clock.forget()
             self.answers += 1
             if guessed:  # from the hello
                 self._delays.clear()
@@ -210,6 +217,7 @@ class Controller:
         self._fresh: dict[int, Session] = {}
         self._due: list[tuple[float, int, Session]] = []  # heaps by when, and what is stale
         self._faded: list[tuple[float, int, Session]] = []
+        self._again: list[tuple[float, int, Session, int]] = []  # answers to repeat: when, of what
         self._tickets = itertools.count()
         self.counts: collections.Counter[str] = collections.Counter()
         self.waited_s: deque[float] = deque(maxlen=1024)
@@ -327,8 +335,8 @@ class Controller:
             return []
         self.counts["embeddings"] += 1
         session.address, session.heard_s = address, now_s
-        late = session.clock.hear(message.step, now_s)
         session.learn(message)
+        late = session.clock.hear(message.step, now_s)
         session.newest = message.capture
         session.fresh = message, late
         self._fresh[device] = session
@@ -348,14 +356,15 @@ class Controller:
         """
         if self._fresh:
             return self._answer_fresh(now_s)
-        return self._look_ahead(now_s)
+        return self._repeat(now_s) or self._look_ahead(now_s)
 
     def due_s(self, now_s: float) -> float:
         """Return in how many seconds there is something to do again, at most 1."""
         if self._fresh:
             return 0.0
-        nexts = [heap[0][0] for heap in (self._due, self._faded) if heap]
-        return min(max(min(nexts, default=now_s + 1.0) - now_s, 0.0), 1.0)
+        heaps: tuple[list[Any], ...] = (self._due, self._faded, self._again)
+        soonest_s = min((heap[0][0] for heap in heaps if heap), default=now_s + 1.0)
+        return min(max(soonest_s - now_s, 0.0), 1.0)
 
     def tidy(self, now_s: float) -> None:
         """Forget devices that have been silent for too long; call it about once a second."""
@@ -395,7 +404,25 @@ class Controller:
             session.z, session.start = z[row], session.base + age
             session.planned = session.start
         self._answering = [session.heard_s for session in sessions]
+        for session in sessions:
+            for repeat in range(1, REPEATS + 1):
+                when_s = now_s + repeat * session.clock.period_s - 1e-9
+                entry = (when_s, next(self._tickets), session, session.base)
+                heapq.heappush(self._again, entry)
         return self._plan(sessions)
+
+    def _repeat(self, now_s: float) -> Outgoing:
+        """Send the newest forces of those that were answered a moment ago once more."""
+        outgoing = []
+        for _ in range(4 * BUCKETS[-1]):
+            if not self._again or self._again[0][0] > now_s:
+                break
+            when_s, _, session, base = heapq.heappop(self._again)
+            known = self.sessions.get(session.hello.device) is session and session.base == base
+            if known and now_s - when_s < session.clock.period_s:  # later ones are of no use
+                outgoing.append((session.datagram(), session.address))
+        self.counts["sent"] += len(outgoing)
+        return outgoing
 
     def sent(self, now_s: float) -> None:
         """Take the time when what :meth:`work` returned was on its way."""

@@ -77,7 +77,6 @@ class Device:
         self._last_step = 0
         self.silent = NO_STEP  # until the first forces
         self._answered, self._lag = NO_STEP, 0
-        self._awaited: tuple[int, int] | None = None  # base and first step, not played yet
         self.counts = dict.fromkeys(protocol.SOURCES, 0)
         self.ignored = 0
 
@@ -183,9 +182,9 @@ class Device:
             self._session = auth.session_key(
                 self._key, self.number, answer.nonce, answer.server_nonce
             )
-            self._counter, self._answered, self._awaited = 0, NO_STEP, None
+            self._counter, self._answered = 0, NO_STEP
             self._sent, self._sent_step = 0, -AGAIN_STEPS
-            self._lag = int((now_s - self._hello_s) / self.period_s)
+            self._lag = int((now_s - self._hello_s) / self.period_s + 1e-6)
             self._heard_s = now_s
             self._nonce = b""
         return True
@@ -200,7 +199,7 @@ class Device:
         self._forces_n = kept | {at: forces_n for at, forces_n in fresh if at >= step}
         self._heard_s, self.silent = now_s, 0
         if message.base != self._answered:
-            self._answered, self._awaited = message.base, (message.base, message.first)
+            self._answered, self._lag = message.base, max(step - message.base, 0)
         return True
 
     # -- forces ---------------------------------------------------------------------------------
@@ -215,8 +214,6 @@ class Device:
         if planned is not None:
             limit_n = self.bundle.force_limit_n
             played = Played(np.clip(planned, -limit_n, limit_n), PLANNED)
-            if self._awaited is not None and step >= self._awaited[1]:
-                self._lag, self._awaited = step - self._awaited[0], None
         elif self.silent < self.watchdog_steps:
             played = Played(self._last.forces_n, HELD)
         elif self._actor is not None:

@@ -90,7 +90,7 @@ class Embedding(NamedTuple):
         number: of the session's embeddings, modulo 256: a gap in it is what was lost.
         answered: capture step of the newest embedding that forces have come back for, or
             :data:`NO_STEP`.
-        lag_steps: steps from that capture to the first force; without one, of the hello's answer.
+        lag_steps: steps from that capture to the answer; without one, of the hello's answer.
         scale, codes: of the embedding: z = codes · scale / 127, int8 [D].
     """
 

@@ -76,6 +76,34 @@ def test_what_an_older_embedding_foresaw_is_never_played_after_a_newer_one():
     assert one.planned_n(4) is not None and one.planned_n(10) is None
 
 
+def test_an_answer_is_repeated_in_the_next_steps():
+    """All that is sent in the step of a kick and in the next is lost: the third step knows it."""
+    lost = (100, 101)
+    server, one = linear.controller(), linear.device()
+    down = lambda k: None if k in lost else 0  # noqa: E731
+    errors = linear.World(server, one, down=down, kicks=(100,)).run(104, gap=50)
+    assert errors[102:].max() > CODED > errors[:100].max()  # it was told that two steps late
+    assert linear.planned_steps(one) == 104
+    assert one.answered == 100
+
+
+def test_a_device_that_has_stood_still_is_not_taken_for_late():
+    """Its steps stop for ten periods, fewer than the lead: the next answers come as promptly."""
+    server, one = linear.controller(), linear.device()
+    linear.connect(server, one)
+    z, now_s, first = np.ones(linear.SIZE, np.float32), 0.0, []
+    for step in range(0, 400, 40):
+        now_s += 40 * linear.PERIOD_S + (10 * linear.PERIOD_S if step == 200 else 0.0)
+        server.receive(one.embed(step, z), 1, now_s)
+        outgoing = [data for data, _ in linear.settle(server, now_s)]
+        first.append(protocol.parse(outgoing[0]).first - step)
+        for data in outgoing:
+            one.receive(data, step, now_s)
+        for k in range(step, step + 40):
+            one.play(k)
+    assert first[:5] == [0] * 5 and first[7:] == [0] * 3  # two answers at most looked late
+
+
 # -- what must change nothing
 
 
@@ -245,13 +273,14 @@ def test_one_device_cannot_take_more_than_its_allowance():
 
 def test_behind_schedule_it_skips_what_is_past():
     server, *_ = ready()
-    planned = server.sessions[1].planned
+    planned, before = server.sessions[1].planned, server.counts["strides"]
     outgoing = linear.settle(server, 4.0)  # 400 steps later
     skipped = server.counts["skipped_strides"]
     assert skipped * linear.STRIDE > 400 - planned - linear.STRIDE
-    assert len(outgoing) <= 1 + (controllers.LEAD_STEPS + linear.STRIDE) / linear.STRIDE
-    first = protocol.parse(outgoing[0][0])
-    assert first.first + len(first.forces_n) >= 400
+    ahead = 1 + (controllers.LEAD_STEPS + linear.STRIDE) / linear.STRIDE
+    assert server.counts["strides"] - before <= ahead
+    last = protocol.parse(outgoing[-1][0])
+    assert last.first + len(last.forces_n) >= 400 + controllers.LEAD_STEPS
 
 
 def test_silent_devices_are_forgotten_and_memory_is_bounded():
