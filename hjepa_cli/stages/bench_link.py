@@ -14,6 +14,7 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -353,8 +354,11 @@ class Serving:
     def __init__(self, process: "subprocess.Popen[bytes]", wait: bool) -> None:
         self.process = process
         self.address = ("", 0)
+        self._last: dict[str, Any] = {}
         if wait:
             self.address = parse_address(self._first()["serving"], "serving")
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def _first(self) -> dict[str, Any]:
         stdout = self.process.stdout
@@ -370,9 +374,16 @@ class Serving:
     def skipped(self) -> int:
         """End the server; return the strides that it skipped."""
         self.process.send_signal(signal.SIGTERM)
-        lines = self.process.communicate(timeout=STARTS_S)[0].splitlines()
-        documents = [json.loads(line) for line in lines if line.startswith(b'{"devices"')]
-        return max((one["counts"].get("skipped_strides", 0) for one in documents), default=0)
+        self.process.wait(timeout=STARTS_S)
+        self._reader.join()
+        return int(self._last.get("counts", {}).get("skipped_strides", 0))
+
+    def _read(self) -> None:
+        """Keep the newest snapshot; a pipe that nobody reads would stop the server."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.startswith(b'{"devices"'):
+                self._last = json.loads(line)
 
 
 @contextlib.contextmanager

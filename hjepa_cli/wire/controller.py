@@ -30,6 +30,7 @@ WINDOW_STEPS = 16  # forces in a datagram: its stride's, and those of the stride
 REPEATS = 7  # of an answer, one a step: what loses it loses the next datagram too, perhaps
 LEAD_STEPS = 12  # that forces are computed ahead of the device, at least
 REMEMBERED_STEPS = 512  # of the forces that were sent; no embedding may be older
+CLOCK_INTERVALS = 3  # all of which a device must be slow in to be taken for slow
 FADED_STEPS = 512  # since its newest embedding: then a device is served after all others
 CLOCK_DATAGRAMS = 16  # of whose arrivals the earliest tells how late the others are
 GREETING = (200.0, 400.0)  # hellos a second of all strangers, and at once
@@ -65,6 +66,9 @@ class Bucket:
 class Clock:
     """It guesses a device's control step from when its datagrams arrive.
 
+    A device may be slower than its period, as computers are that have too much to do; one that is
+    so in each of its last few intervals is taken at its word.
+
     Args:
         period_s: of a control step, in wall time.
     """
@@ -72,28 +76,36 @@ class Clock:
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s
         self._starts_s: deque[float] = deque(maxlen=CLOCK_DATAGRAMS)
+        self._paces_s: deque[float] = deque(maxlen=CLOCK_INTERVALS)
+        self._step, self._present, self._at_s, self._pace_s = 0, 0, 0.0, period_s
 
     def hear(self, step: int, now_s: float) -> int:
         """Take an arrival; return how many steps later than the promptest one it came."""
+        if self._starts_s and step > self._step:
+            self._paces_s.append((now_s - self._at_s) / (step - self._step))
+            slowest = len(self._paces_s) == CLOCK_INTERVALS
+            self._pace_s = max(self.period_s, min(self._paces_s) if slowest else 0.0)
         start_s = now_s - step * self.period_s
         late = round((start_s - min(self._starts_s, default=start_s)) / self.period_s)
         if late > LEAD_STEPS:  # so late that its clock has stood still, or ours has jumped
-            self.forget()
+            self._starts_s.clear()
             late = 0
         self._starts_s.append(start_s)
-        return max(late, 0)
+        late = max(late, 0)
+        self._step, self._present, self._at_s = step, step + late, now_s
+        return late
 
     def forget(self) -> None:
-        """Start anew: the device's steps have stood still for a while."""
+        """Take the next arrival for prompt: the device's steps have stood still for a while."""
         self._starts_s.clear()
 
     def step(self, now_s: float) -> int:
         """Return the step that the device is in by now."""
-        return int((now_s - min(self._starts_s)) / self.period_s + 1e-6)
+        return self._present + int((now_s - self._at_s) / self._pace_s + 1e-6)
 
     def time_s(self, step: int) -> float:
         """Return when the device begins a step."""
-        return min(self._starts_s) + step * self.period_s
+        return self._at_s + (step - self._present) * self._pace_s
 
 
 class Session:

@@ -22,6 +22,7 @@ from hjepa_cli.wire.server import written
 
 DEADLINE = 0.8  # share of a step after which its force is played, answered or not
 CONNECT_S = 3.0
+AT_ONCE = 256  # datagrams that a device takes at most before it goes on
 LATE_STEPS = 3  # a step that begins so much later is where the clock goes on from
 
 
@@ -186,7 +187,7 @@ class Drive:
             wait: until the time is there, whatever comes.
         """
         device = self._device
-        while True:
+        for _ in range(AT_ONCE):  # a flood must not keep a device from its step
             try:
                 data, _ = self._socket.recvfrom(protocol.LARGEST_BYTES + 1)
                 device.receive(data, k + wait, time.monotonic())  # what comes now is for the next

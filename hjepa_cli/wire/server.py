@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from hjepa_cli.compute.interrupts import Postponed
 from hjepa_cli.errors import Unavailable, UsageError
 from hjepa_cli.wire import protocol
 from hjepa_cli.wire.controller import Controller
@@ -111,23 +112,29 @@ class Server:
         controller.say = self._note
 
     def run(self, until_s: float = float("inf")) -> None:
-        """Serve until a time of the monotonic clock, or an interruption; then say goodbye."""
-        try:
-            while (now_s := time.monotonic()) < until_s:
-                self._receive(now_s)
-                if outgoing := self._controller.work(time.monotonic()):
-                    self._send(outgoing)
-                    self._controller.sent(time.monotonic())
-                if now_s >= self._next_s:
-                    self._next_s = now_s + SECOND_S
-                    self._each_second(now_s)
-                if not outgoing:
-                    wait_s = min(
-                        self._controller.due_s(now_s), self._next_s - now_s, until_s - now_s
-                    )
-                    select.select([self._socket], [], [], max(wait_s, 0.0))
-        finally:
-            self._send(self._controller.farewell())
+        """Serve until a time of the monotonic clock, or an interruption; then say goodbye.
+
+        An interruption waits for the end of a round, so that no line is half printed.
+        """
+        with Postponed() as signals, signals.postpone() as stopped:
+            try:
+                while (now_s := time.monotonic()) < until_s and not stopped():
+                    self._round(now_s, until_s)
+            finally:
+                self._send(self._controller.farewell())
+
+    def _round(self, now_s: float, until_s: float) -> None:
+        """Take what has come, do a batch of work, and wait if there is nothing more to do."""
+        self._receive(now_s)
+        if outgoing := self._controller.work(time.monotonic()):
+            self._send(outgoing)
+            self._controller.sent(time.monotonic())
+        if now_s >= self._next_s:
+            self._next_s = now_s + SECOND_S
+            self._each_second(now_s)
+        if not outgoing:
+            next_s = min(now_s + self._controller.due_s(now_s), self._next_s, until_s)
+            select.select([self._socket], [], [], max(next_s - time.monotonic(), 0.0))
 
     def _receive(self, now_s: float) -> None:
         for _ in range(AT_ONCE):

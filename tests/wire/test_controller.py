@@ -317,6 +317,26 @@ def test_a_restarted_server_takes_a_device_up_within_a_second():
             fresh.receive(killed.embed(step, np.ones(linear.SIZE, np.float32)), 1, now_s)
 
 
+def test_a_device_that_is_slower_than_its_period_gets_every_force():
+    """Both sides have too little time: strides are skipped by what the device needs, not by when.
+
+    Steps take three periods, and the controller is let work only every eighth step.
+    """
+    server, one = linear.controller(), linear.device()
+    linear.connect(server, one)
+    z = np.ones(linear.SIZE, np.float32)
+    for step in range(800):
+        now_s = 3 * step * linear.PERIOD_S
+        if step % 40 == 0:
+            server.receive(one.embed(step, z), 1, now_s)
+        if step % 8 == 0:
+            for data, _ in linear.settle(server, now_s):
+                one.receive(data, step, now_s)
+        source = one.play(step).source
+        assert step < 200 or source == protocol.PLANNED, step
+    assert server.counts["skipped_strides"] * linear.STRIDE < 2 * 3 * 200
+
+
 def test_a_device_whose_clock_jumps_is_still_driven():
     """Its steps stand still for two seconds, then go on; or leap ahead by a thousand."""
     server, one = linear.controller(), linear.device()

@@ -98,7 +98,7 @@ def test_two_clients_over_real_sockets():
     server, listening = open_socket(("127.0.0.1", 0)), open_socket(("127.0.0.1", 0))
     ideal = [Direction(Impairment(duplicate=0.999999), 0, way) for way in (0, 1)]
     relay = Relay(listening, server.getsockname(), socket.AF_INET, *ideal)
-    thread = threading.Thread(target=relay.run, args=(time.monotonic() + 5.0,))
+    thread = threading.Thread(target=relay.run, args=(time.monotonic() + 1.5,))
     thread.start()
     clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
     server.setblocking(True)
