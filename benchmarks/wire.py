@@ -99,14 +99,18 @@ def encoder(exported: Path, checkpoint: str, rounds: int) -> int:
 
 def start(exported: Path, rounds: int) -> int:
     """Time a device's start."""
-    command = [*HJEPA, "device", "--model", str(exported), "--server", "127.0.0.1:9"]
-    command += ["--steps", "1", "--quiet"]
+    serve = [*HJEPA, "serve", "--model", str(exported), "--bind", "127.0.0.1:0", "--json"]
     times_s = []
-    for _ in range(rounds):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run(command, check=True)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        times_s.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    with subprocess.Popen(serve, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as server:
+        assert server.stdout is not None
+        address = json.loads(server.stdout.readline())["serving"]
+        command = [*HJEPA, "device", "--model", str(exported), "--server", address]
+        for _ in range(rounds):
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            subprocess.run([*command, "--steps", "1", "--quiet"], check=True)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            times_s.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+        server.kill()
     peak_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     median_s = statistics.median(times_s)
     print(f"start {median_s:.2f} s of CPU, median of {rounds}, peak {peak_mb:.0f} MB")

@@ -65,6 +65,7 @@ PERIOD_MS = 5.0
 STARTS_S = 20.0  # that a server may take
 KILLED_S, STOPPED_S = 0.5, 2.0  # how long harm lasts
 THETA = "theta"
+START_STEPS = 16  # of real time in which all devices send at once: none counts as missed
 COMPARED = (1, 20, 50, 100, 300, 1000)  # steps after which angles are compared
 
 
@@ -149,7 +150,7 @@ def run(
         fleet = Fleet(
             *(bundle, runtime, moved, camera, draws, sent, NO_KEY, period_s),
             local=harm is not None,
-            grace_steps=latest_steps(link),
+            grace_steps=latest_steps(link) + (0 if lockstep else START_STEPS),
             lost=link.lost,
         )
         with screen.progress("wire", steps, "steps") as bar:

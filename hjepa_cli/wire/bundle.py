@@ -72,7 +72,7 @@ class Bundle:
         return float(self.manifest["step_s"])
 
     def network(self, name: str) -> Path:
-        """Return a network's file after checking it against the manifest.
+        """Return the file of a network's graph, after checking graph and weights.
 
         Raises:
             DataError: they are others, or there is no such network.
@@ -80,16 +80,22 @@ class Bundle:
         entry = self.manifest["networks"].get(name)
         if entry is None:
             raise DataError(f"{self.directory} holds no network '{name}'", hint=_again(self))
-        path = self.directory / entry["file"]
-        data = files.read_bytes(path, limit=_LIMIT_BYTES)
-        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise DataError(f"{path} is not the file that {MANIFEST} names", hint=_again(self))
-        return path
+        for file, digest in entry["files"].items():
+            path = self.directory / file
+            data = files.read_bytes(path, limit=_LIMIT_BYTES)
+            if hashlib.sha256(data).hexdigest() != digest:
+                raise DataError(f"{path} is not the file that {MANIFEST} names", hint=_again(self))
+        return self.directory / f"{name}.onnx"
 
     def verify(self) -> None:
         """Check every network. Raises as :meth:`network`."""
         for name in self.manifest["networks"]:
             self.network(name)
+
+
+def files_of(name: str) -> tuple[str, str]:
+    """Return the files of a network: its graph, and its weights, which a runtime maps."""
+    return f"{name}.onnx", f"{name}.bin"
 
 
 def _again(bundle: Bundle) -> str:
@@ -126,7 +132,7 @@ def open_bundle(directory: Path) -> Bundle:
             and 0 < len(bundle.plant.encode()) <= 16
             and isinstance(manifest["camera"], dict)
             and set(networks) <= set(NETWORKS)
-            and all(entry["file"] == f"{name}.onnx" for name, entry in networks.items())
+            and all(set(entry["files"]) == set(files_of(name)) for name, entry in networks.items())
         )
     except (KeyError, TypeError, ValueError):
         good = False

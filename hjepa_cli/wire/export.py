@@ -45,6 +45,7 @@ from hjepa_cli.wire.bundle import (
     NETWORKS,
     SCHEMA,
     Bundle,
+    files_of,
     open_bundle,
 )
 from hjepa_cli.wire.runtime import Runtime
@@ -52,7 +53,7 @@ from hjepa_cli.wire.runtime import Runtime
 CALIBRATION, CHECKED = 512, 256  # frame pairs, of trajectories 0 … and of held-out ones
 FLOAT_CONVOLUTIONS = 7  # of the int8 encoder: the stem, and three of each of two stages
 LARGEST_ERROR = 1e-5  # of z, and of forces ÷ limit, against torch
-OURS = {MANIFEST, CHECK, *(f"{name}.onnx" for name in NETWORKS)}
+OURS = {MANIFEST, CHECK, *(file for name in NETWORKS for file in files_of(name))}
 Inputs = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Shape of a row and type of each input, by name."""
 LARGEST_INT8 = {"rms_z": 0.015, "rms_force_n": 0.05}
@@ -234,18 +235,36 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
 def _write(
     directory: Path, name: str, data: bytes, inputs: Inputs, outputs: tuple[str, ...]
 ) -> dict[str, Any]:
-    files.write_bytes(directory / f"{name}.onnx", data)
+    digests = {}
+    for file, part in _split(data, name).items():
+        files.write_bytes(directory / file, part)
+        digests[file] = hashlib.sha256(part).hexdigest()
     described = {
         of: {"shape": ["n", *shape], "dtype": str(dtype).removeprefix("torch.")}
         for of, (shape, dtype) in inputs.items()
     }
     return {
-        "file": f"{name}.onnx",
-        "sha256": hashlib.sha256(data).hexdigest(),
+        "files": digests,
         "inputs": described,
         "outputs": list(outputs),
         "precision": "int8" if name.endswith("int8") else "fp32",
     }
+
+
+def _split(data: bytes, name: str) -> dict[str, bytes]:
+    """Return a network's graph and its weights: a runtime holds weights from a file once less."""
+    import onnx
+
+    graph, weights = files_of(name)
+    with tempfile.TemporaryDirectory() as scratch:
+        onnx.save_model(
+            onnx.load_from_string(data),
+            Path(scratch, graph),
+            save_as_external_data=True,
+            location=weights,
+            size_threshold=1024,
+        )
+        return {file: Path(scratch, file).read_bytes() for file in (graph, weights)}
 
 
 def _onnx(module: nn.Module, inputs: Inputs, outputs: tuple[str, ...]) -> bytes:

@@ -144,7 +144,7 @@ def test_old_doubled_and_foreign_datagrams_change_nothing():
 
 
 def test_a_recorded_session_proves_nothing_to_a_new_server():
-    _, one, sent, _ = ready()
+    _, _, sent, _ = ready()
     hello = linear.device().upkeep(0.0)
     server = linear.controller()
     server.receive(hello, "thief", 0.0)

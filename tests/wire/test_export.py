@@ -50,7 +50,7 @@ def test_the_check_finds_another_network(copy, checkpoint):
     data = model.SerializeToString()
     (directory / "actor.onnx").write_bytes(data)
     manifest = json.loads((directory / MANIFEST).read_text())
-    manifest["networks"]["actor"]["sha256"] = hashlib.sha256(data).hexdigest()
+    manifest["networks"]["actor"]["files"]["actor.onnx"] = hashlib.sha256(data).hexdigest()
     (directory / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(NumericalError, match="force"):
         export.check(open_bundle(directory), checkpoint)
@@ -91,14 +91,15 @@ def test_follow_is_that_of_the_simulator(exported, checkpoint):
     np.testing.assert_array_equal(found[0], z[0])
 
 
-def test_a_changed_byte_is_refused(copy):
+@pytest.mark.parametrize("file", ["planner.onnx", "planner.bin"])
+def test_a_changed_byte_is_refused(copy, file):
     from hjepa_cli.wire.runtime import Runtime
 
     directory = copy()
-    data = bytearray((directory / "planner.onnx").read_bytes())
+    data = bytearray((directory / file).read_bytes())
     data[len(data) // 2] ^= 1
-    (directory / "planner.onnx").write_bytes(bytes(data))
-    with pytest.raises(DataError, match=r"planner\.onnx"):
+    (directory / file).write_bytes(bytes(data))
+    with pytest.raises(DataError, match=file):
         Runtime(open_bundle(directory)).warm_up("planner")
 
 
@@ -106,8 +107,9 @@ def test_a_changed_byte_is_refused(copy):
     "change",
     [
         {"plant": ""}, {"plant": "a name that is far too long"}, {"embedding": 0}, {"stride": "4"},
-        {"force_limit_n": -1}, {"networks": {"encoder": {"file": "../../etc/passwd"}}},
-        {"networks": {"shell": {"file": "shell.onnx"}}}, {"camera": None}, {"action_shape": [0]},
+        {"force_limit_n": -1}, {"networks": {"encoder": {"files": {"../../etc/passwd": ""}}}},
+        {"networks": {"shell": {"files": {"shell.onnx": "", "shell.bin": ""}}}},
+        {"camera": None}, {"action_shape": [0]},
     ],
 )  # fmt: skip
 def test_manifests_that_say_nonsense_are_refused(copy, change):
