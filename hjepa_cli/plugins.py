@@ -66,6 +66,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "scale": "hjepa_cli.stages.pipeline:SCALE",
         "survive": "hjepa_cli.stages.pipeline:SURVIVE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
+        "bench-link": "hjepa_cli.stages.pipeline:BENCH_LINK",
     },
     "codec": {
         "float32": f"{_CONTROL}.codecs.float:FLOAT32",

@@ -74,3 +74,12 @@ REPRODUCE = _stage(
     "reproduce", "Run all stages into one folder and write the report.", "reproduce",
     product="report",
 )  # fmt: skip
+BENCH_LINK = _stage(
+    "bench-link",
+    "Drive simulated devices through the wire and in the simulator, and compare.",
+    "bench_link",
+    inputs=(
+        *("model", "devices", "steps", "lockstep", "period_ms", "gap_steps", "delivery", "trace"),
+        *("harm", "checkpoint", "backend"),
+    ),
+)

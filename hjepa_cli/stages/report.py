@@ -27,7 +27,7 @@ Figures = dict[str, tuple[str, Any]]
 
 STAGES = (
     *("train-encoder", "train-hierarchy", "train-reflex", "train-fusion"),
-    *("eval", "scale", "survive"),
+    *("eval", "scale", "survive", "bench-link"),
 )
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
@@ -290,9 +290,18 @@ def survival_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
     return {"survival": (caption, figures.survival_figure(result))}
 
 
+def wire_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+    """Draw how late answers came and where forces came from."""
+    from hjepa_cli.output import figures
+
+    caption = "Control steps from a picture to the first force that answers it; who drove"
+    return {"wire": (caption, figures.wire_figure(result))}
+
+
 FIGURES: dict[str, Callable[..., Figures]] = {
     **{stage: training_figures for stage in STAGES if stage.startswith("train-")},
     "eval": eval_figures,
     "scale": scale_figures,
     "survive": survival_figures,
+    "bench-link": wire_figures,
 }

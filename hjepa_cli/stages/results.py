@@ -98,6 +98,11 @@ class _Reflexes(_Trained):
     n_rollouts: Whole
 
 
+class _Fusion(_Trained):
+    packets: Whole
+    distances: dict[str, Number]
+
+
 class _Evaluation(msgspec.Struct):
     plant: str
     seed: Whole
@@ -197,13 +202,42 @@ class _Survival(msgspec.Struct):
     figures: list[str] = []
 
 
+class _Wire(msgspec.Struct):
+    model: str
+    method: str
+    plant: str
+    seed: Whole
+    devices: Whole
+    steps: Whole
+    lockstep: bool
+    period_ms: Positive | None
+    score_link: Number
+    score_link_ci95: tuple[Number, Number]
+    score_simulated: Number
+    score_simulated_ci95: tuple[Number, Number]
+    score_difference: Number
+    score_difference_ci95: tuple[Number, Number]
+    n_devices: Whole
+    n_steps: Whole
+    missing_share: NotNegative
+    late_answers_share: NotNegative
+    ages: dict[str, Whole]
+    sources: dict[str, Whole]
+    skipped_strides: Whole
+    theta_difference_rad: dict[str, NotNegative] = {}
+    fallen_share: NotNegative | None = None
+    taken_up_after_s: NotNegative | None = None
+
+
 RESULTS = {
     "train-encoder": _Encoder,
     "train-hierarchy": _Hierarchy,
     "train-reflex": _Reflexes,
+    "train-fusion": _Fusion,
     "eval": _Evaluation,
     "scale": _Scale,
     "survive": _Survival,
+    "bench-link": _Wire,
 }
 
 
