@@ -1,27 +1,31 @@
 """What a 5G uplink carries of each payload, beside Shannon's capacity.
 
-    python benchmarks/nr_devices.py [--symbols 14,4] [--snr 10:30] [--folder DIR] [--plant desktop]
+    python benchmarks/nr_devices.py [--symbols 14,4] [--snr 10:30] [--plant desktop]
 
-The tolerated gap of each payload is measured as ``hjepa scale --payload …`` does (or taken from the
-zoo's curves), once, in a folder that keeps it; counts of the law ``duty`` follow for each physical
-layer. Prints Markdown tables: devices with 95 % CI by payload and SNR, and what a packet takes.
+The tolerated gap of each payload comes from the zoo's curves or is searched as ``hjepa eval`` does;
+counts of the law ``duty`` follow for each physical layer. Prints Markdown tables: devices with
+95 % CI by payload and SNR, and what a packet takes.
 """
 
 import argparse
 import dataclasses
-import json
-import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
-from hjepa_cli.config.schema import NrSettings
+from hjepa_cli.config.schema import NrSettings, Settings
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.evaluation.bench import Bench
+from hjepa_cli.core.evaluation.load_simulator import LoadSimulator, PacketBits
+from hjepa_cli.core.evaluation.protocol import Point, Search
+from hjepa_cli.core.evaluation.workers import open_workers
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.duty import DUTY
-from hjepa_cli.core.radio.laws.requirement import LinkRequirement
+from hjepa_cli.core.radio.laws.requirement import GAP, LinkRequirement
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.measuring import cached
+from hjepa_cli.stages.model_set import open_model_set
 
 SOURCES = {  # payload and method
     "int8": ("int8", "hjepa"),
@@ -35,13 +39,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--symbols", default="14,4", help="PUSCH symbols, a list")
     parser.add_argument("--snr", default="10:30")
-    parser.add_argument("--folder", type=Path, default=Path("nr-devices"))
     parser.add_argument("--plant", default="desktop")
     options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
     settings = load_settings(flags={"plant": options.plant})
     kind, grid_db = plant(settings.plant), parse_snr(options.snr)
-    loops = {name: measured(options, *source) for name, source in SOURCES.items()}
+    loops = {name: measured(options.plant, *source) for name, source in SOURCES.items()}
     layers = {"Shannon": Cell.of(settings, kind)}
     for symbols in map(int, options.symbols.split(",")):
         radio = dataclasses.replace(settings.radio, phy="nr", snr_db=options.snr)
@@ -82,23 +84,40 @@ def main() -> None:
                     )
 
 
-def measured(options: argparse.Namespace, payload: str, method: str) -> LinkRequirement:
-    """What a loop tolerates, of ``hjepa scale``."""
-    line = [sys.executable, "-m", "hjepa_cli", "scale", "--json", "--quiet", "--snr", "20"]
-    line += ["--methods", method, "--payload", payload, "--plant", options.plant]
-    done = subprocess.run(line, cwd=options.folder, check=True, stdout=subprocess.PIPE)
-    document: dict[str, Any] = json.loads(done.stdout)
-    [row] = document["rows"]
-    low, high = row["tolerance_ci95"]
+def measured(plant_name: str, payload: str, method: str) -> LinkRequirement:
+    """What a loop tolerates, with 64 devices in steady state."""
+    flags = {"plant": plant_name, "protocol.payload": payload, "methods": (method,)}
+    settings = load_settings(flags=flags)
+    models = open_model_set(settings, Screen(quiet=True), None, None)
+    if found := cached(models, [method]):
+        return LinkRequirement.measured(GAP, method, found[method][0])
+    print(f"measuring {method}, {payload}", file=sys.stderr, flush=True)
+    return searched(settings, models, method)
+
+
+def searched(settings: Settings, models: Any, method: str) -> LinkRequirement:
+    """Search the tolerated gap alone."""
+    protocol, file = settings.protocol, models.of(method).file
+    with open_workers(protocol.total_steps * protocol.bracket_devices) as workers:
+        bench = Bench(protocol, settings.seed, workers.runner(settings, file))
+        grid = [Point("gap", float(gap)) for gap in protocol.gaps]
+        few = bench.measure(method, grid, protocol.curve_devices)
+        search = Search(grid, few, bench.reference, protocol)
+        while wanted := search.wanted():
+            outcome = bench.measure(method, wanted, protocol.bracket_devices)
+            for row, point in enumerate(wanted):
+                search.add(point, outcome.part(slice(row, row + 1)))
+        bits = workers.results([workers.submit(LoadSimulator, settings, file, PacketBits(method))])
+    found = search.result()
     return LinkRequirement(
         method=method,
-        tolerance=row["tolerance"],
-        interval=(low, high),
-        at_least=row["at_least"],
-        payload_bits=row["bits_per_transmission"],
+        tolerance=found.gap,
+        interval=found.interval,
+        at_least=found.censored,
+        payload_bits=bits[0],
         delay_steps=0,
-        warmup_steps=document["warmup_steps"],
-        scored_steps=document["scored_steps"],
+        warmup_steps=protocol.warmup_steps,
+        scored_steps=protocol.steps,
     )
 
 
