@@ -62,7 +62,7 @@ def run(
     secret = key_for(address, "--server", key)
     bundle, kind = open_bundle(model), plant_of(settings)
     check_plant(bundle, settings)
-    if not same_camera(bundle.manifest["camera"], kind):
+    if not same_camera(bundle.manifest["camera"], kind.camera()):
         raise DataError(
             f"{model} was exported with another camera than plant {kind.name} has now",
             hint=exported_by(model),
