@@ -74,7 +74,7 @@ def run(
 
         def simulated() -> Camera:
             moved = actual_plant(settings.plant, settings.conditions)
-            seen = actual_camera(settings.plant, settings.conditions, settings.seed)
+            seen = actual_camera(settings)
             plants.append(
                 SimulatedPlant(moved, seen, settings.protocol, settings.seed, FIRST_DEVICE)
             )
