@@ -193,8 +193,14 @@ def open_model_set(
 
 
 def under_law_of(model: Model, settings: Settings) -> Settings:
-    """Return settings with the law that a model learned, for all that is compared with it."""
+    """Return settings with the law that a model learned, for all that is compared with it.
+
+    A ceiling is nobody's to learn: that of the settings stays where the model brings none.
+    """
     control = control_of(model.metadata["settings"], model.digest)
+    if not control.ceiling_gains_n:
+        ceiling = settings.control.ceiling_gains_n
+        control = dataclasses.replace(control, ceiling_gains_n=ceiling)
     return dataclasses.replace(settings, control=control)
 
 

@@ -64,7 +64,8 @@ def small(
     seed: int = 0, methods: tuple[str, ...] = (*PIXELS, *TRUE_STATE), **changes: Any
 ) -> Settings:
     """All of the protocol, in a few seconds."""
-    settings = load_settings("smoke", flags={"seed": seed, "methods": methods})
+    flags = {"seed": seed, "methods": methods, "control.ceiling_gains_n": [-60, -35, -110, -8]}
+    settings = load_settings("smoke", flags=flags)
     tiny = {
         "warmup_steps": 0,
         "steps": 24,
