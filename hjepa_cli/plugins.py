@@ -36,6 +36,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "desktop": "hjepa_cli.core.plants.cartpole.plant:DESKTOP",
         "gym": "hjepa_cli.core.plants.cartpole.plant:GYM",
         "quadrotor": "hjepa_cli.core.plants.quadrotor:QUADROTOR",
+        "recorded": "hjepa_cli.core.plants.recorded:UNKNOWN",
     },
     "scheduler": {
         "round-robin": "hjepa_cli.core.radio.schedulers.round_robin:ROUND_ROBIN",
@@ -65,6 +66,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "scale": "hjepa_cli.stages.pipeline:SCALE",
         "survive": "hjepa_cli.stages.pipeline:SURVIVE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
+        "bench-link": "hjepa_cli.stages.pipeline:BENCH_LINK",
     },
     "codec": {
         "float32": f"{_CONTROL}.codecs.float:FLOAT32",

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from hjepa_cli.config.schema import (
+    RECORDED,
     EncoderSettings,
     NrSettings,
     ProtocolSettings,
@@ -53,7 +54,7 @@ def resolve(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -
     plant = flags["plant"]
     settings = load_settings(preset, config, flags)
     held = [load_settings(settings.preset, file).plant for file in (None, config)]
-    if plant is not None and plant not in held:
+    if plant not in (None, RECORDED, *held):  # of a recorded one its dataset holds all
         other = f"--preset {plant} for plant {plant}; other values of it by --config FILE.toml"
         own = f'--config FILE.toml with plant = "{plant}" and its values'
         raise UsageError(

@@ -17,6 +17,7 @@ from msgspec import Meta
 
 LARGEST = sys.float_info.max  # bounds what is not bounded otherwise: no infinity, no NaN
 LARGEST_SEED = 2**63 - 1
+RECORDED = "recorded"  # the plant of imported datasets
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 
 MOST = 10**9  # of anything: beyond what any machine holds or any program counts
@@ -31,6 +32,8 @@ NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 GreyLevels = Annotated[float, Meta(ge=0, le=255)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+SidePx = Annotated[int, Meta(ge=16, le=1024)]  # of a picture
+Sign = Annotated[float, Meta(ge=-1, le=1)]
 Candidates = Annotated[int, Meta(ge=4, le=10_000)]  # of a round of CMA-ES
 Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
 
@@ -53,6 +56,37 @@ class Flag:
 
 
 STRIDE_H = Flag("--h", "Stride of the high level in control steps, a multiple of m.")
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraSettings:
+    """Frames have this size in datasets and networks; a dataset brings its own along.
+
+    Simulated cameras take 64 × 128 and are resized by area.
+    """
+
+    height_px: SidePx = 64
+    width_px: SidePx = 128
+    grey: bool = False
+
+    @property
+    def frame_shape(self) -> tuple[int, int, int]:
+        """Return (H, W, C), with one channel for grey and three for colours."""
+        return self.height_px, self.width_px, 1 if self.grey else 3
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedSettings:
+    """A plant that only recordings are known of is what their dataset says of it.
+
+    Actions are stored ÷ ``limits``; ``mirror`` has a factor for each, 1 or −1, where mirrored
+    pictures show a plant that mirrored actions move alike, and is empty where they do not.
+    """
+
+    step_s: Positive = 0.02
+    limits: tuple[Positive, ...] = (1.0,)
+    states: tuple[str, ...] = ()
+    mirror: tuple[Sign, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -601,6 +635,8 @@ class Settings:
     control: ControlSettings = ControlSettings()
     tune: TuneSettings = TuneSettings()
     fusion: FusionSettings = FusionSettings()
+    camera: CameraSettings = CameraSettings()
+    recorded: RecordedSettings = RecordedSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
     actor: ActorSettings = ActorSettings()
@@ -615,8 +651,9 @@ class Settings:
     def as_dict(self) -> dict[str, Any]:
         """Return nested plain data, ready for JSON (tuples become lists).
 
-        Empty lists and the zeros of an ideal link are left out: they stand for values that say the
-        same, and digests of settings stay what they were before there were such settings.
+        Empty lists, the zeros of an ideal link, the usual camera and what only recorded plants
+        have are left out: they stand for values that say the same, and digests of settings stay
+        what they were before there were such settings.
         """
         values = _without_empty(plain(dataclasses.asdict(self)))
         for key in IDEAL_LINK:
@@ -624,6 +661,10 @@ class Settings:
                 del values["protocol"][key]
         if not values["control"]:
             del values["control"]
+        if self.camera == CameraSettings():
+            del values["camera"]
+        if self.plant != RECORDED:
+            del values["recorded"]
         return values
 
 

@@ -256,6 +256,27 @@ def error_figure(entries: Entries, *, step_s: float) -> Figure:
 
 
 @matplotlib.rc_context(RC)
+def wire_figure(result: Mapping[str, Any]) -> Figure:
+    """Draw ``bench-link --json``: answers by their age, device-steps by who drove."""
+    figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
+    left, right = figure.subplots(2, 1)
+    ages = {int(age): count for age, count in result["ages"].items()}
+    answers = max(sum(ages.values()), 1)
+    left.bar(list(ages), [count / answers for count in ages.values()], color="#0072B2")
+    left.set_xlabel("Steps from picture to force")
+    left.set_ylabel("Share of answers")
+    driven = {name: count for name, count in result["sources"].items() if count}
+    steps = max(sum(driven.values()), 1)
+    names = list(driven)
+    right.barh(names, [driven[name] / steps for name in names], color="#0072B2")
+    right.set_xlabel("Share of device-steps")
+    right.set_xlim(0, 1)
+    for axes in (left, right):
+        axes.grid(False)
+    return figure
+
+
+@matplotlib.rc_context(RC)
 def training_figure(rows: Sequence[Mapping[str, str]]) -> Figure:
     """Draw a training run's ``metrics.csv``: losses, and health where it was measured.
 

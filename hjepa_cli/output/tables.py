@@ -119,6 +119,59 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
     screen.say(result["source"])
 
 
+def show_offline(result: dict[str, Any], screen: Screen) -> None:
+    """Print what recordings say of each method: its error, and how long that is small."""
+    entries = result["methods"]
+    first = next(iter(entries.values()))
+    windows = list(first["nmae_windows"])
+    within = list(first["steps_within"])
+    where = f"split {result['split']} of {result['dataset']}"
+    screen.table(
+        f"{where}: NMAE by steps since the packet, with every packet, and steps until it exceeds a "
+        f"share of the range ({first['n_rollouts']} trajectories)",
+        ["method", *windows, "every", *(f"≤ {most}" for most in within), "bits"],
+        [
+            [
+                name,
+                *(_number(entry["nmae_windows"][window], 4) for window in windows),
+                _number(entry["nmae_every_step"], 4),
+                *(str(entry["steps_within"][most]) for most in within),
+                entry["bits_per_transmission"],
+            ]
+            for name, entry in entries.items()
+        ],
+    )
+    rows = []
+    for name, of in result["latent"].items():
+        last = len(of["steps"]) - 1
+        for at in sorted({0, last // 2, last} - {-1}):
+            rows.append(
+                [
+                    *(name, str(of["steps"][at]), _number(of["error"][at], 4)),
+                    _number(of["still"][at], 4),
+                ]
+            )
+    if rows:
+        screen.table(
+            f"{where}: 1 − cos of predicted and seen embeddings under the recorded actions",
+            ["method", "steps", "predicted", "nothing changes"],
+            rows,
+        )
+    if result["probe_r2"]:
+        probes = result["probe_r2"]
+        screen.table(
+            "states read off embeddings, held out",
+            [*probes],
+            [[_number(value, 3) for value in probes.values()]],
+        )
+    else:
+        screen.say("no states were recorded: probes are absent")
+    screen.say(
+        "recordings say nothing of closed loops; hjepa scale --tolerance-steps STEPS counts the "
+        "devices of a gap that you take to be safe"
+    )
+
+
 def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
 

@@ -62,7 +62,7 @@ SCALE = _stage(
     "scale",
     "Count the devices that one radio cell supports, by method and signal-to-noise ratio.",
     "scale",
-    inputs=("checkpoint", "further", "dataset", "remeasure", "verify"),
+    inputs=("checkpoint", "further", "dataset", "remeasure", "verify", "tolerance_steps"),
 )
 SURVIVE = _stage(
     "survive",
@@ -74,3 +74,12 @@ REPRODUCE = _stage(
     "reproduce", "Run all stages into one folder and write the report.", "reproduce",
     product="report",
 )  # fmt: skip
+BENCH_LINK = _stage(
+    "bench-link",
+    "Drive simulated devices through the wire and in the simulator, and compare.",
+    "bench_link",
+    inputs=(
+        *("model", "devices", "steps", "lockstep", "period_ms", "gap_steps", "delivery", "trace"),
+        *("harm", "checkpoint", "backend"),
+    ),
+)

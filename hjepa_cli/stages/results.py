@@ -98,6 +98,11 @@ class _Reflexes(_Trained):
     n_rollouts: Whole
 
 
+class _Fusion(_Trained):
+    packets: Whole
+    distances: dict[str, Number]
+
+
 class _Evaluation(msgspec.Struct):
     plant: str
     seed: Whole
@@ -107,6 +112,36 @@ class _Evaluation(msgspec.Struct):
     acceptable_score: Number = 0.0
     acceptable_lq_ratio: Number = 0.0
     source: str = ""
+
+
+class _OfflineEntry(msgspec.Struct):
+    n_rollouts: Whole
+    nmae: list[NotNegative]
+    nmae_ci95: list[Interval]
+    nmae_windows: Windows
+    nmae_every_step: NotNegative | None
+    steps_within: dict[str, Whole]
+    bits_per_transmission: NotNegative
+
+
+class _Latent(msgspec.Struct):
+    steps: list[Whole]
+    error: list[Number]
+    still: list[Number]
+
+
+class _Offline(msgspec.Struct):
+    """What ``eval`` says of a recorded plant."""
+
+    plant: str
+    seed: Whole
+    step_s: Positive
+    checkpoint: str | None
+    dataset: str
+    split: str
+    methods: Annotated[dict[str, _OfflineEntry], Meta(min_length=1)]
+    latent: dict[str, _Latent]
+    probe_r2: Windows
 
 
 class _Scale(msgspec.Struct):
@@ -167,13 +202,42 @@ class _Survival(msgspec.Struct):
     figures: list[str] = []
 
 
+class _Wire(msgspec.Struct):
+    model: str
+    method: str
+    plant: str
+    seed: Whole
+    devices: Whole
+    steps: Whole
+    lockstep: bool
+    period_ms: Positive | None
+    score_link: Number
+    score_link_ci95: tuple[Number, Number]
+    score_simulated: Number
+    score_simulated_ci95: tuple[Number, Number]
+    score_difference: Number
+    score_difference_ci95: tuple[Number, Number]
+    n_devices: Whole
+    n_steps: Whole
+    missing_share: NotNegative
+    late_answers_share: NotNegative
+    ages: dict[str, Whole]
+    sources: dict[str, Whole]
+    skipped_strides: Whole
+    theta_difference_rad: dict[str, NotNegative] = {}
+    fallen_share: NotNegative | None = None
+    taken_up_after_s: NotNegative | None = None
+
+
 RESULTS = {
     "train-encoder": _Encoder,
     "train-hierarchy": _Hierarchy,
     "train-reflex": _Reflexes,
+    "train-fusion": _Fusion,
     "eval": _Evaluation,
     "scale": _Scale,
     "survive": _Survival,
+    "bench-link": _Wire,
 }
 
 
@@ -229,10 +293,13 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     """Return what keeps a result from being shown, if anything."""
     if stage not in RESULTS:
         return "its stage is none of ours"
+    offline = stage == "eval" and bool(result.get("offline"))
     try:
-        msgspec.convert(result, RESULTS[stage])
+        msgspec.convert(result, _Offline if offline else RESULTS[stage])
     except msgspec.ValidationError as error:
         return str(error)
+    if offline:
+        return _offline_flaw(result)
     if stage == "eval":
         entries = result["methods"]
         former = {"tolerance_gap_lq_steps": None}  # which older ones lack
@@ -253,6 +320,20 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     return None
 
 
+def _offline_flaw(result: Mapping[str, Any]) -> str | None:
+    """Return what keeps an evaluation on recordings from being shown, if anything."""
+    entries = result["methods"]
+    for name, entry in entries.items():
+        if len(entry["nmae"]) != len(entry["nmae_ci95"]):
+            return f"method '{name}': its errors and their intervals are not as many"
+    for name, of in result["latent"].items():
+        if not len(of["steps"]) == len(of["error"]) == len(of["still"]):
+            return f"latent of '{name}': its lists are not equally long"
+    return _unlike("methods", [entry["nmae_windows"] for entry in entries.values()]) or _unlike(
+        "methods", [entry["steps_within"] for entry in entries.values()]
+    )
+
+
 def _unlike(what: str, windows: list[dict[str, Any]]) -> str | None:
-    """Return the complaint where not all have the same windows of steps."""
+    """Return the complaint where not all have the same keys, windows of steps as a rule."""
     return f"its {what} have different windows" if len({*map(frozenset, windows)}) > 1 else None

@@ -15,6 +15,7 @@ from hjepa_cli.core.datasets.dataset import MANIFEST
 from hjepa_cli.errors import DataError, MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import STAGES
+from hjepa_cli.stages import import_data
 from hjepa_cli.stages.collect import describe_finished, recorded_settings
 from hjepa_cli.stages.plan import Plan
 from hjepa_cli.stages.stage import Stage
@@ -41,6 +42,9 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
     if (directory / MANIFEST).exists():
         torchrun.refuse()
         return describe_finished(directory, screen)
+    if (directory / LOG).exists() and import_data.is_import(directory):
+        torchrun.refuse()
+        return import_data.resume(directory, screen)
     stage, settings, inputs = recall(directory, screen)
     if not stage.shared:
         torchrun.refuse()
@@ -64,7 +68,7 @@ def given_to(stage: Stage, inputs: dict[str, Any]) -> dict[str, Any]:
     """
     given: dict[str, Any] = {"further": []}
     for name, value in inputs.items():
-        if isinstance(value, bool):
+        if isinstance(value, bool | int | float | str):
             given[name] = value
         elif isinstance(value, dict) and isinstance(value.get("path"), str):
             given[name] = path = Path(value["path"])
@@ -108,7 +112,7 @@ def recall(directory: Path, screen: Screen) -> tuple[Stage, Settings, dict[str, 
             raise
         raise UsageError(
             f"{directory} was made by hjepa {made_by}, this is {__version__}: {error.message}",
-            hint=f"take it up with hjepa {made_by}; or anew: {anew(found)} --out DIR",
+            hint=f"take it up with that version; or anew: {anew(found)} --out DIR",
         ) from None
     if made_by != __version__:
         screen.say(f"begun by hjepa {made_by}, this is {__version__}: results may differ")

@@ -136,7 +136,7 @@ def run(
     films = [film(name, settings, models.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.total_steps // 100, 1)
     kind = actual_plant(settings.plant, settings.conditions)
-    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    camera = actual_camera(settings)
     pictures = animation.Pictures(films, link, kind, camera, every)
     result = {
         "checkpoint": models.path,

@@ -337,7 +337,7 @@ def test_quiet_prints_only_where_the_result_is(shell, stage):
 
 
 @pytest.mark.parametrize("command", MODULES)
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", sorted({*PRESETS} - {"recorded"}))  # which needs a dataset
 def test_dry_run_shows_a_plan_and_writes_nothing(shell, command, preset):
     with shell.untouched():
         outcome = shell(command, "--dry-run", "--preset", preset)

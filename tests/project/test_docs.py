@@ -20,6 +20,7 @@ NOT_RUN = re.compile(r"<!-- not run: [^>]+ -->\s*```\w*\n.*?```", re.DOTALL)
 WITH_PLAN = (
     *("collect", "train-encoder", "train-hierarchy", "eval", "scale", "survive", "view"),
     "reproduce",
+    *("export", "serve", "device", "link", "bench-link"),
 )
 PLACEHOLDER = re.compile(r"[A-Z]{3,}|…|\.\.\.|[<>\[\]|]|\{")
 
