@@ -40,8 +40,9 @@ def execute(command: Command, given: Given) -> None:
             plan = getattr(command.plan, "function", command.plan)
             parameters = inspect.signature(plan).parameters
             takes_all = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
-            wanted = [name for name in inputs if name in parameters or takes_all]
-            planned = plan(**{name: inputs[name] for name in wanted if name != "screen"})
+            further = inputs.keys() - {"screen"} if takes_all else set()
+            wanted = inputs.keys() & (parameters.keys() | further)
+            planned = plan(**{name: inputs[name] for name in wanted})
             if not isinstance(planned, Plan):
                 raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")
             memory.check(planned.memory_bytes, command.name)

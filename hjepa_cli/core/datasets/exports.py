@@ -117,7 +117,8 @@ def write_npz(
         for name, array in arrays.items():
             put(name, iter([array]), array.shape)
         if pixels is not None:
-            put("pixels", pixels, (len(values["action"]), *frame_shape))
+            rows = len(next(iter(values.values())))  # of the first column
+            put("pixels", pixels, (rows, *frame_shape))
 
 
 def blocks(split: Trajectories, frames: Frames, tick: Callable[[int], None]) -> Iterator[Any]:
