@@ -90,6 +90,12 @@ def require(module: str, what: str, extra: str, instead: str = "") -> None:
         )
 
 
+class Unavailable(HjepaError):
+    """A network peer does not answer, or an address or a port cannot be had."""
+
+    exit_code = 69
+
+
 class NumericalError(HjepaError):
     """Training diverged, or a stage gate failed."""
 

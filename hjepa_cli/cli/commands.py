@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from hjepa_cli.cli.flags import Input, stage_input
+from hjepa_cli.cli.flags import INPUTS, Input, stage_input
 from hjepa_cli.config.checks import check_cell, compared_methods
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import origins
@@ -16,7 +16,7 @@ from hjepa_cli.errors import UsageError
 from hjepa_cli.plugins import STAGES
 from hjepa_cli.stages.stage import Imported
 
-PIPELINE, TOOLS = "Pipeline", "Tools"
+PIPELINE, TOOLS, WIRE = "Pipeline", "Tools", "Over a wire"
 GROUPS = {
     "data": "Import, describe, verify, look at and export datasets.",
     "models": "List, describe and verify trained models.",
@@ -111,7 +111,14 @@ def _check_cell(settings: Settings, given: Given) -> None:
 
     parse_snr(settings.radio.snr_db)
     keys = (name.partition(":")[0] for name in SCALE)
-    check_cell(settings.radio, {key: given[key] for key in keys})
+    check_cell(settings.radio, {key: given[key] for key in keys}, settings.nr)
+
+
+def _check_survival(settings: Settings, given: Given) -> None:
+    from hjepa_cli.core.radio.capacity import parse_snr
+
+    parse_snr(settings.radio.snr_db)
+    check_cell(settings.radio, nr=settings.nr)
 
 
 def _add_sources(settings: Settings, given: Given) -> None:
@@ -120,9 +127,31 @@ def _add_sources(settings: Settings, given: Given) -> None:
     given["sources"] = origins(settings.preset, given["config"], flags)
 
 
+def _one_rule(settings: Settings, given: Given) -> None:
+    if given["innovation"] is not None and given["gap_steps"] != INPUTS["gap_steps:wire"].default:
+        raise UsageError("--gap and --innovation are two rules to send by; give one of them")
+
+
+def _one_schedule(settings: Settings, given: Given) -> None:
+    if given["delivery"] is not None and given["gap_steps"] != INPUTS["gap_steps:wire"].default:
+        raise UsageError("--gap and --delivery are two kinds of uplink; give one of them")
+    if given["lockstep"] and given["period_ms"]:
+        raise UsageError("--lockstep counts time in the plant's steps: leave --period-ms out")
+
+
+_LINK = tuple(
+    f"{way}_{name}"
+    for way in ("up", "down")
+    for name in (
+        *("loss", "burst", "delay_ms", "jitter_ms", "reorder", "duplicate", "rate_kbps", "trace"),
+    )
+)
 SCALE = (
     *("radio.snr_db", "radio.law", "radio.schedulers", "radio.uncertainty", "radio.topology"),
     *("radio.bandwidth_hz", "radio.noise", "radio.power_margin_db", "radio.coherence_slots"),
+    *("radio.fading", "radio.speed_m_s", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+    *("nr.pusch_symbols", "nr.mcs_table", "nr.mcs", "nr.bler_target", "nr.link_adaptation"),
+    *("nr.cqi_age_slots", "nr.harq_rounds", "nr.grants", "nr.grants_per_slot", "nr.reports"),
     *("radio.seeds", *MEASURED, "remeasure", "verify", "tolerance_steps", "checkpoint"),
     *("dataset:clean", "out"),
 )
@@ -188,6 +217,17 @@ COMMANDS = (
         prepare=_figure_of_all,
     ),
     staged("scale", takes=(*SCALE, *COMPUTED, *PARALLEL), check=_check_cell),
+    staged(
+        "survive",
+        takes=(
+            *("survival.intervals_steps", "survival.loops", "survival.splitting_paths"),
+            *("survival.loss", "survival.burst_transfers", "survival.mean_time_h"),
+            *("radio.snr_db", "radio.bandwidth_hz", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+            *("nr.pusch_symbols", "nr.bler_target", "nr.harq_rounds"),
+            *(*MEASURED, "checkpoint", "out", *COMPUTED, *PARALLEL),
+        ),
+        check=_check_survival,
+    ),
     Command(
         "resume",
         "Take up an interrupted run: same settings, same inputs, same result.",
@@ -224,6 +264,57 @@ COMMANDS = (
         Imported("hjepa_cli.stages.compare:run"),
         ("paths:evaluations", "methods:compare", "figures:compare", "formats"),
         panel=TOOLS,
+    ),
+    Command(
+        "export",
+        "Write a model for serve and device: ONNX networks, a manifest, checked against torch.",
+        Imported("hjepa_cli.stages.export:run"),
+        ("name_or_path:export", "to", "check", "method", "backend"),
+        product="directory",
+        plan=Imported("hjepa_cli.stages.export:plan"),
+        panel=WIRE,
+    ),
+    Command(
+        "serve",
+        "Drive devices over UDP with an exported model.",
+        Imported("hjepa_cli.stages.serve:run"),
+        (
+            *("model", "bind", "key", "max_devices", "timeout_s", "metrics", "websocket"),
+            *("backend", "for_s"),
+        ),
+        plan=Imported("hjepa_cli.stages.serve:plan"),
+        panel=WIRE,
+    ),
+    Command(
+        "device",
+        "Be a device: look, encode, send, and play the forces that come back.",
+        Imported("hjepa_cli.stages.device:run"),
+        (
+            *("model", "server", "key", "number", "camera", "crop", "actuator", "period_ms"),
+            *("gap_steps:wire", "innovation", "longest_steps", "watchdog_ms", "local"),
+            *("stop_after_s", "steps:wire", "precision", "backend", *RESOLVED),
+        ),
+        check=_one_rule,
+        plan=Imported("hjepa_cli.stages.device:plan"),
+        panel=WIRE,
+    ),
+    Command(
+        "link",
+        "Pass datagrams on as a bad network would: losses, delay, jitter, order, rate; seeded.",
+        Imported("hjepa_cli.stages.link:run"),
+        ("listen", "to:link", *_LINK, "seed:link", "for_s"),
+        plan=Imported("hjepa_cli.stages.link:plan"),
+        panel=WIRE,
+    ),
+    staged(
+        "bench-link",
+        takes=(
+            *("model", "devices:bench", "steps:bench", "lockstep", "period_ms", "gap_steps:wire"),
+            *("delivery:bench", *LINK, "trace", "harm", "checkpoint:bench", "backend", "out"),
+            *RESOLVED,
+        ),
+        check=_one_schedule,
+        panel=WIRE,
     ),
     Command(
         "data import",

@@ -7,7 +7,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 
 from hjepa_cli.cli.commands import Command, Given
@@ -30,6 +30,7 @@ def execute(command: Command, given: Given) -> None:
     with _guard(screen), _locating(command, given):
         del given["plugin"]  # loaded before the commands were listed
         dry_run, _ = given.pop("dry_run", False), given.pop("debug")
+        parallel = "workers" in given
         workers, cluster = given.pop("workers", None), given.pop("cluster", None)
         if command.prepare is not None:
             command.prepare(given)
@@ -48,10 +49,8 @@ def execute(command: Command, given: Given) -> None:
             memory.check(planned.memory_bytes, command.name)
             planned.show(screen)
             return
-        from hjepa_cli.compute.executors import placed
-
         prints = redirect_stdout(sys.stderr) if screen.json else nullcontext()  # a plugin's
-        with placed(workers, cluster), prints:
+        with _placed(workers, cluster) if parallel else nullcontext(), prints:
             result = command.run(**inputs)
         if not isinstance(result, dict):
             raise UsageError(f"{command.name} returned {result!r}; expected a dict, for --json")
@@ -61,6 +60,13 @@ def execute(command: Command, given: Given) -> None:
             screen.emit(result)
         elif screen.quiet and command.product and (made := result[command.product]) is not None:
             screen.result(str(made))  # otherwise the stage has said where it is
+
+
+def _placed(workers: int | None, cluster: str | None) -> AbstractContextManager[None]:
+    """Place parallel work; a command that has none does not import what it takes."""
+    from hjepa_cli.compute.executors import placed
+
+    return placed(workers, cluster)
 
 
 def _settings(command: Command, given: Given) -> Given:

@@ -31,12 +31,14 @@ from hjepa_cli.config.schema import (
 )
 from hjepa_cli.config.settings import PRESETS, PROTOCOLS
 from hjepa_cli.errors import MissingInputError
-from hjepa_cli.plugins import LAWS, METHODS, PLANTS, SCHEDULERS
+from hjepa_cli.plugins import LAWS, METHODS, PHYS, PLANTS, SCHEDULERS
 
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
+WIRE, UPLINK, DOWNLINK = "Wire", "Uplink", "Downlink"
 SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
 PANELS = {  # of help, by section
     "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "radio": RADIO,
+    "nr": RADIO, "survival": LOOP,
     "": SETTINGS,
 }  # fmt: skip
 
@@ -46,6 +48,7 @@ NAMES: Mapping[str, Iterable[str]] = {
     "methods": METHODS,
     "radio.schedulers": SCHEDULERS,
     "radio.law": LAWS,
+    "radio.phy": PHYS,
 }
 
 
@@ -370,6 +373,158 @@ _RADIO = {
         "STEPS",
     ),
 }
+_Milliseconds = Annotated[float, Meta(ge=0, le=1e6)]
+_Seconds = Annotated[float, Meta(gt=0, le=1e9)]
+_Share = Annotated[float, Meta(ge=0, lt=1)]
+
+
+def _address(name: str, text: str, default: Any = None) -> Input:
+    return Input(str, name, text, "HOST:PORT", default=default)
+
+
+_WIRE = {
+    "name_or_path:export": _argument(
+        str, "Model to export: a zoo name or a path.", "[MODEL]", completion.models
+    ),
+    "to": _output("Directory to write the exported model to.", "DIR", name="--to"),
+    "check": _output("Compare what is in this directory with torch again.", "DIR", name="--check"),
+    "method": Input(
+        str, "--method", "What plans the strides. Without it: the model's first method.", "NAME"
+    ),
+    "model": Input(
+        Path, "--model", "Exported model, of hjepa export MODEL --to DIR.", "DIR", default=...
+    ),
+    "backend": Input(
+        Literal["onnxruntime", "openvino"],
+        "--backend",
+        "What computes the networks; openvino is fast in batches (extra openvino).",
+        default="onnxruntime",
+    ),
+    "precision": Input(Literal["fp32", "int8"], "--precision", "Of the encoder.", default="fp32"),
+    "bind": _address("--bind", "Address to serve on; port 0 takes any.", "127.0.0.1:4747"),
+    "server": _address("--server", "Address of hjepa serve, or of a relay.", "127.0.0.1:4747"),
+    "key": Input(
+        Path,
+        "--key",
+        "File with the key that server and devices share; serve makes it where there is none. "
+        "Needed but on loopback.",
+        "FILE",
+    ),
+    "metrics": _address("--metrics", "Also answer Prometheus here, under /metrics."),
+    "websocket": _address("--websocket", "Also serve slow clients here, in openpi's wire format."),
+    "max_devices": Input(Count, "--max-devices", "Devices at a time.", default=1024),
+    "timeout_s": Input(
+        _Seconds, "--timeout", "A device silent for so long is forgotten.", "SECONDS", default=10.0
+    ),
+    "for_s": Input(
+        _Seconds, "--for", "End after so long. Without it: when interrupted.", "SECONDS"
+    ),
+    "number": Input(
+        Annotated[int, Meta(ge=0, le=2**32 - 1)],
+        "--number",
+        "The device's own number; without it a random one.",
+    ),
+    "camera": Input(
+        str,
+        "--camera",
+        "sim, a camera's number, a directory of pictures, or a video file.",
+        "NAME",
+        default="sim",
+    ),
+    "crop": Input(
+        str, "--crop", "Part of the camera's picture that the model sees, in pixels.", "X,Y,W,H"
+    ),
+    "actuator": Input(
+        str, "--actuator", "sim, none, or serial:PORT. Without it: sim where the camera is.", "NAME"
+    ),
+    "period_ms": Input(
+        Annotated[float, Meta(ge=0.1, le=1e5)],
+        "--period-ms",
+        "Wall time of a control step. Without it: the plant's own.",
+        "MS",
+    ),
+    "gap_steps:wire": Input(
+        Count, "--gap", "Send an embedding every so many control steps.", "STEPS", default=80
+    ),
+    "innovation": Input(
+        Annotated[float, Meta(gt=0, le=1)],
+        "--innovation",
+        "Instead of --gap: send when the controller's force is wrong by this share of its range.",
+        "SHARE",
+    ),
+    "longest_steps": Input(
+        Count, "--longest", "With --innovation: send at least so often.", "STEPS", default=320
+    ),
+    "watchdog_ms": Input(
+        Annotated[float, Meta(ge=0, le=80)],
+        "--watchdog-ms",
+        "Silence after which the actor on the device drives, in the plant's time; at most 80.",
+        "MS",
+        default=40.0,
+    ),
+    "local": Input(
+        bool,
+        "--local/--no-local",
+        "When the controller is silent the actor on the device drives, or it stops at 0 N.",
+        default=True,
+    ),
+    "stop_after_s": Input(
+        _Seconds, "--stop-after", "End when the controller has been silent for so long.", "SECONDS"
+    ),
+    "steps:wire": Input(Count, "--steps", "Control steps. Without it: until interrupted."),
+    "listen": _address("--listen", "Address for devices; port 0 takes any.", "127.0.0.1:4748"),
+    "to:link": _address("--to", "Address of the server.", "127.0.0.1:4747"),
+    "seed:link": Input(CountOrNone, "--seed", "Seed of what happens to datagrams.", default=0),
+    "lockstep": _switch(
+        "--lockstep", "No deadlines: compare with the simulator step by step, in one process."
+    ),
+    "devices:bench": Input(Count, "--devices", "Devices at a time.", default=64),
+    "steps:bench": Input(Annotated[int, Meta(ge=20)], "--steps", "Control steps.", default=1000),
+    "delivery:bench": Input(
+        Annotated[float, Meta(gt=0, le=1)],
+        "--delivery",
+        "Instead of --gap: share of packets that arrive, one being sent in every step.",
+        "P",
+    ),
+    "trace": Input(
+        Path,
+        "--trace",
+        "Delays and losses of a recorded link, for both; a line per datagram: MS or lost.",
+        "FILE",
+    ),
+    "checkpoint:bench": _model(
+        "--checkpoint", "The model that was exported. Without it: the zoo's of the same digest."
+    ),
+    "harm": Input(
+        Literal["kill", "stop"],
+        "--harm",
+        "In the middle kill the server and start it again after 500 ms, or stop it for 2 s.",
+    ),
+}
+_LINKS = {
+    f"{way}_{name}": Input(
+        *(kind, f"--{way}link-{name.replace('_', '-')}", text, metavar),
+        default=default,
+        panel=panel,
+    )
+    for way, panel in (("up", UPLINK), ("down", DOWNLINK))
+    for name, kind, text, metavar, default in (
+        ("loss", _Share, "Share of datagrams that are lost.", "SHARE", 0.0),
+        (
+            *("burst", Annotated[float, Meta(ge=1, le=1e6)]),
+            *("Mean length of a burst of losses; 1: independent.", "DATAGRAMS", 1.0),
+        ),
+        ("delay_ms", _Milliseconds, "What every datagram takes.", "MS", 0.0),
+        ("jitter_ms", _Milliseconds, "Up to so much more.", "MS", 0.0),
+        ("reorder", _Share, "Share that overtakes the others.", "SHARE", 0.0),
+        ("duplicate", _Share, "Share that comes twice.", "SHARE", 0.0),
+        (
+            *("rate_kbps", Annotated[float, Meta(ge=0, le=1e9)]),
+            *("What passes in a second; 0: all.", "KBPS", 0.0),
+        ),
+        ("trace", Path, "A recorded link; a line per datagram: MS or lost.", "FILE", None),
+    )
+}
 _SETTINGS = {
     "preset": Input(
         str,
@@ -401,8 +556,8 @@ _SETTINGS = {
     "plugin": Input(
         list[Path],
         "--plugin",
-        "Python file that adds plants, codecs, schedulers, methods, laws or stages; may be "
-        "repeated.",
+        "Python file that adds plants, codecs, schedulers, methods, laws, physical layers or "
+        "stages; may be repeated.",
         "FILE.py",
         default=[],
     ),
@@ -414,17 +569,10 @@ _SCREEN = {
     "debug": _switch("--debug", "Show the traceback of an error (also: HJEPA_DEBUG=1)."),
 }
 INPUTS = {
-    name: dataclasses.replace(one, panel=panel)
+    name: dataclasses.replace(one, panel=one.panel or panel)
     for panel, listed in (
-        *(
-            (FILES, _FILES),
-            ("", _ARGUMENTS),
-            (DATA, _DATA),
-            (DATA, _IMPORT),
-            (LOOP, _LOOP),
-            (RADIO, _RADIO),
-        ),
-        *((SETTINGS, _SETTINGS), (SCREEN, _SCREEN)),
+        *((FILES, _FILES), ("", _ARGUMENTS), (DATA, _DATA), (DATA, _IMPORT), (LOOP, _LOOP)),
+        *((RADIO, _RADIO), (WIRE, _WIRE), (WIRE, _LINKS), (SETTINGS, _SETTINGS), (SCREEN, _SCREEN)),
     )
     for name, one in listed.items()
 }

@@ -1,5 +1,6 @@
 """Tables show what a training stage or an evaluation found."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hjepa_cli.core.control.force_error import WINDOWS
@@ -173,3 +174,37 @@ def show_offline(result: dict[str, Any], screen: Screen) -> None:
 
 def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
+
+
+ALLOCATION = (  # of rows of ``scale --json`` under a physical layer with transport blocks
+    *("mcs", "modulation_order", "code_rate", "prbs", "data_symbols", "dmrs_re_per_prb"),
+    *("tbs_bits", "segments", "bler", "grants", "packets_per_slot", "latency_s"),
+)
+
+
+def show_allocations(rows: Sequence[Mapping[str, Any]], screen: Screen) -> None:
+    """Print what a packet is sent on, once for each size, SNR and kind of grant."""
+    found = {
+        (row["bits_per_transmission"], row["snr_db"], row["grants"]): row
+        for row in rows
+        if "mcs" in row
+    }
+    if not found:
+        return
+    screen.table(
+        "what a packet takes; packets get through per slot of the loop",
+        [
+            *("bits", "SNR [dB]", "grants", "MCS", "Qm", "R", "PRBs", "symbols", "TBS [bits]"),
+            *("blocks", "BLER", "packets", "latency [ms]"),
+        ],
+        [
+            [
+                *(bits, f"{snr_db:g}", grants, row["mcs"], row["modulation_order"]),
+                *(f"{row['code_rate']:.3f}", row["prbs"], row["data_symbols"], row["tbs_bits"]),
+                row["segments"],
+                f"{'≤ ' if row['bler_is_bound'] else ''}{row['bler']:.4f}",
+                *(f"{row['packets_per_slot']:.1f}", f"{row['latency_s'] * 1e3:.2f}"),
+            ]
+            for (bits, snr_db, grants), row in sorted(found.items())
+        ],
+    )

@@ -170,7 +170,7 @@ def open_model_set(
             hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
         )
     if model:
-        if settings.plant == RECORDED:  # as the dataset has it
+        if settings.plant == RECORDED and dataset:
             check_same_plant(model.metadata, settings, f"model {path}")
         settings = under_law_of(model, settings)
     data = open_dataset(dataset, settings) if dataset else None

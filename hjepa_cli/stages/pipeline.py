@@ -64,7 +64,22 @@ SCALE = _stage(
     "scale",
     inputs=("checkpoint", "further", "dataset", "remeasure", "verify", "tolerance_steps"),
 )
+SURVIVE = _stage(
+    "survive",
+    "Measure how long loops go on without expected packets, and what links that takes.",
+    "survive",
+    inputs=("checkpoint", "further"),
+)
 REPRODUCE = _stage(
     "reproduce", "Run all stages into one folder and write the report.", "reproduce",
     product="report",
 )  # fmt: skip
+BENCH_LINK = _stage(
+    "bench-link",
+    "Drive simulated devices through the wire and in the simulator, and compare.",
+    "bench_link",
+    inputs=(
+        *("model", "devices", "steps", "lockstep", "period_ms", "gap_steps", "delivery", "trace"),
+        *("harm", "checkpoint", "backend"),
+    ),
+)

@@ -25,7 +25,10 @@ Result = dict[str, Any]
 Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
-STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "train-fusion", "eval", "scale")
+STAGES = (
+    *("train-encoder", "train-hierarchy", "train-reflex", "train-fusion"),
+    *("eval", "scale", "survive", "bench-link"),
+)
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
 
@@ -279,8 +282,26 @@ def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Pat
     return {"devices": (caption, figures.scale_figure(result))}
 
 
+def survival_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+    """Draw the share of loops that a gap loses."""
+    from hjepa_cli.output import figures
+
+    caption = "Loops lost in a single gap between packets, 95 % Clopper-Pearson intervals"
+    return {"survival": (caption, figures.survival_figure(result))}
+
+
+def wire_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+    """Draw how late answers came and where forces came from."""
+    from hjepa_cli.output import figures
+
+    caption = "Control steps from a picture to the first force that answers it; who drove"
+    return {"wire": (caption, figures.wire_figure(result))}
+
+
 FIGURES: dict[str, Callable[..., Figures]] = {
     **{stage: training_figures for stage in STAGES if stage.startswith("train-")},
     "eval": eval_figures,
     "scale": scale_figures,
+    "survive": survival_figures,
+    "bench-link": wire_figures,
 }

@@ -22,6 +22,7 @@ LARGEST = 1e100  # bounds beyond anything that is measured keep arithmetic in ra
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=1e-100, le=LARGEST)]
+Probability = Annotated[float, Meta(ge=0, le=1)]
 Whole = Annotated[int, Meta(ge=0, le=10**18)]
 Interval = tuple[NotNegative, NotNegative]
 Windows = dict[str, Number | None]
@@ -65,7 +66,7 @@ class _Row(msgspec.Struct):
     tolerance_ci95: Interval | None = None
     delay_steps: NotNegative | None = 0
     reports_per_block_slot: NotNegative | None = None
-    coverage: Annotated[float, Meta(ge=0, le=1)] | None = None
+    coverage: Probability | None = None
 
 
 class _Gain(msgspec.Struct):
@@ -95,6 +96,11 @@ class _Reflexes(_Trained):
     reflex: _Reflex
     nmae_windows: Annotated[dict[str, Windows], Meta(min_length=1)]
     n_rollouts: Whole
+
+
+class _Fusion(_Trained):
+    packets: Whole
+    distances: dict[str, Number]
 
 
 class _Evaluation(msgspec.Struct):
@@ -153,12 +159,85 @@ class _Scale(msgspec.Struct):
     figures: list[str] = []
 
 
+class _Lost(msgspec.Struct):
+    gap_steps: Positive
+    p_lost: Probability
+    p_lost_ci95: tuple[Probability, Probability]
+    p_left_band: Probability
+    back_steps_median: NotNegative | None
+    back_steps_p95: NotNegative | None
+
+
+class _Losses(msgspec.Struct):
+    method: str
+    interval_steps: Positive
+    points: Annotated[list[_Lost], Meta(min_length=1)]
+
+
+class _SurvivalTime(msgspec.Struct):
+    method: str
+    transfer_interval_s: Positive
+    loss_probability: Probability
+    how: str
+    at_least: bool
+    survival_steps: NotNegative
+    survival_ci95: tuple[NotNegative, NotNegative | None]
+    tolerance_gap_steps: NotNegative | None
+    availability: Probability | None
+    tolerated_loss: Probability
+    tolerated_loss_bursts: Probability
+    devices: Whole
+
+
+class _Survival(msgspec.Struct):
+    plant: str
+    seed: Whole
+    step_s: Positive
+    n_loops: Annotated[int, Meta(ge=1, le=10**18)]
+    phy: str
+    bandwidth_hz: Positive
+    mean_time_h: Positive
+    rows: Annotated[list[_SurvivalTime], Meta(min_length=1)]
+    curves: Annotated[list[_Losses], Meta(min_length=1)]
+    figures: list[str] = []
+
+
+class _Wire(msgspec.Struct):
+    model: str
+    method: str
+    plant: str
+    seed: Whole
+    devices: Whole
+    steps: Whole
+    lockstep: bool
+    period_ms: Positive | None
+    score_link: Number
+    score_link_ci95: tuple[Number, Number]
+    score_simulated: Number
+    score_simulated_ci95: tuple[Number, Number]
+    score_difference: Number
+    score_difference_ci95: tuple[Number, Number]
+    n_devices: Whole
+    n_steps: Whole
+    missing_share: NotNegative
+    late_answers_share: NotNegative
+    ages: dict[str, Whole]
+    sources: dict[str, Whole]
+    skipped_strides: Whole
+    theta_difference_rad: dict[str, NotNegative] = {}
+    fallen_share: NotNegative | None = None
+    taken_up_after_s: NotNegative | None = None
+
+
 RESULTS = {
     "train-encoder": _Encoder,
     "train-hierarchy": _Hierarchy,
     "train-reflex": _Reflexes,
+    "train-fusion": _Fusion,
     "eval": _Evaluation,
     "scale": _Scale,
+    "survive": _Survival,
+    "bench-link": _Wire,
 }
 
 

@@ -68,7 +68,7 @@ def given_to(stage: Stage, inputs: dict[str, Any]) -> dict[str, Any]:
     """
     given: dict[str, Any] = {"further": []}
     for name, value in inputs.items():
-        if isinstance(value, bool | int | float):
+        if isinstance(value, bool | int | float | str):
             given[name] = value
         elif isinstance(value, dict) and isinstance(value.get("path"), str):
             given[name] = path = Path(value["path"])

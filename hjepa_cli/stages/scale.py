@@ -17,10 +17,12 @@ from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.capacity import parse_snr
+from hjepa_cli.core.radio.doppler import check_speed
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.output.tables import ALLOCATION, show_allocations
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.stages import results
 from hjepa_cli.stages.evaluate import reads_of
@@ -72,7 +74,7 @@ def run(
     """
     radio, kind = settings.radio, plant_of(settings)
     grid_db = parse_snr(radio.snr_db)
-    check_cell(radio, {"remeasure": remeasure})
+    check_cell(radio, {"remeasure": remeasure}, settings.nr)
     count = counting(settings, screen, checkpoint, dataset, further, tolerance_steps)
     given: dict[str, Any] = {"verify": verify}
     if tolerance_steps is not None:
@@ -91,6 +93,8 @@ def run(
                 "acceptable_score": settings.protocol.acceptable_score,
                 "link": link.facts(settings.protocol, len(kind.force_signs)),
                 "law": radio.law,
+                "phy": radio.phy,
+                **({} if radio.phy == "shannon" else {"nr": settings.as_dict()["nr"]}),
                 "bandwidth_hz": radio.bandwidth_hz,
                 "slot_s": kind.step_s,
                 "limit_bits_per_s": kind.data_rate_limit_bits_per_s,
@@ -104,6 +108,7 @@ def run(
             result = record.finish(result)
         with results.showing("scale", recorded, record.directory):
             count.show(result)
+            show_allocations(result["rows"], screen)
             screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
             enforce(result)
         return result
@@ -123,7 +128,7 @@ def plan(
     """Plan a count of devices; arguments as of :func:`run`."""
     radio, protocol = settings.radio, settings.protocol
     grid_db = parse_snr(radio.snr_db)
-    check_cell(radio, {"remeasure": remeasure})
+    check_cell(radio, {"remeasure": remeasure}, settings.nr)
     quiet = Screen(quiet=True)
     count = counting(settings, quiet, checkpoint, dataset, further, tolerance_steps)
     if isinstance(count, BySimulation):
@@ -181,7 +186,7 @@ def counting(
     tolerance_steps: float | None = None,
 ) -> ByFormula | BySimulation:
     """Open what is to be counted under the law of the settings; arguments as of :func:`run`."""
-    law = LAWS[settings.radio.law]
+    law, radio = LAWS[settings.radio.law], settings.radio
     if tolerance_steps is not None:
         if not isinstance(law, ClosedFormLaw):
             raise UsageError(
@@ -194,6 +199,8 @@ def counting(
             "a recorded plant has no closed loop to measure a tolerance in",
             hint="hjepa scale --tolerance-steps STEPS; hjepa eval says how forces err with time",
         )
+    if radio.fading != "block":
+        check_speed(radio.speed_m_s, radio.carrier_ghz, plant_of(settings).step_s)
     if isinstance(law, ClosedFormLaw):
         return ByFormula(law, settings, screen, checkpoint, dataset, further)
     return BySimulation(settings, screen, checkpoint, further)
@@ -202,6 +209,8 @@ def counting(
 def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> Path:
     """Write the rows in long format: a line per SNR and method, units in the header."""
     text = io.StringIO()
+    if any("mcs" in row for row in rows):
+        columns = (*columns, *ALLOCATION)
     table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     table.writeheader()
     for row in rows:

@@ -11,13 +11,13 @@ from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
 from hjepa_cli.core.plants.frames import frame_bits
 from hjepa_cli.core.plants.named import plant_of
-from hjepa_cli.core.radio.capacity import Cell
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.output.screen import Screen, described_steps, percent, span
-from hjepa_cli.plugins import LAWS, METHODS
+from hjepa_cli.plugins import LAWS, METHODS, PHYS
 from hjepa_cli.stages.evaluate import open_measurable
 from hjepa_cli.stages.measuring import curves_for, measure_points
 from hjepa_cli.stages.verification import VERIFY_AT, show_verdicts, verdict
@@ -43,7 +43,7 @@ class ByFormula:
     ) -> None:
         self.models = open_measurable(settings, screen, checkpoint, dataset, further)
         self._law, self._settings, self._screen = law, settings, screen
-        self._cell = Cell.of(settings.radio, plant_of(settings))
+        self._cell = Cell.of(settings, plant_of(settings))
 
     def measured_methods(self, grid_db: Sequence[float]) -> dict[float, list[str]]:
         """Return by SNR the methods that can be measured, late where the law makes them so.
@@ -180,6 +180,8 @@ def described(result: Mapping[str, Any]) -> str:
     law = f"{result['law']} law{link.described(result.get('link', {}))}"
     if result.get("noise") == "scaled" and "radio.noise" in LAWS[result["law"]].uses:
         law += ", scaled noise"
+    if (phy := result.get("phy", "shannon")) != "shannon":
+        law += f", {PHYS[phy].help}" if phy in PHYS else f", {phy}"
     return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
 
 

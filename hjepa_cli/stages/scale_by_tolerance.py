@@ -12,7 +12,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control import link
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant_of
-from hjepa_cli.core.radio.capacity import Cell
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
@@ -54,7 +54,7 @@ class ByTolerance(ByFormula):
         self.models = ModelSet(settings, model, path, None)
         self._law, self._settings, self._screen = law, settings, screen
         self._steps, self._kind = tolerance_steps, plant_of(settings)
-        self._cell = Cell.of(settings.radio, self._kind)
+        self._cell = Cell.of(settings, self._kind)
         embedding = model.architecture["embedding"] if model else settings.encoder.embedding
         told = link.confirmation_bits(settings.protocol, len(self._kind.force_signs))
         self._bits = CODECS[settings.protocol.payload].bits(embedding) + told

@@ -197,6 +197,12 @@ def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> C
             hint="hjepa train-hierarchy, or pass --checkpoint PATH",
         )
     checkpoint = load_checkpoint(path)
+    if checkpoint.metadata["plant"] != settings.plant:
+        raise DataError(
+            f"model {path} drives plant {checkpoint.metadata['plant']}, "
+            f"the dataset is of plant {settings.plant}",
+            hint=f"hjepa train-hierarchy --plant {settings.plant}",
+        )
     check_same_plant(checkpoint.metadata, settings, f"model {path}")
     architecture = checkpoint.metadata.get("architecture")
     kind = architecture.get("kind") if isinstance(architecture, dict) else None

@@ -1,6 +1,7 @@
 """Small recordings: a bright square that two actions push around, in every format."""
 
 import csv
+import io
 import json
 
 import numpy as np
@@ -161,9 +162,15 @@ def lerobot(root, frames, actions, states, *, version):
     return root
 
 
-def minari(root, frames, actions):
-    """Write the HDF5 of a dataset of Minari."""
+def minari(root, frames, actions, *, encoded=False):
+    """Write the HDF5 of a dataset of Minari, which keeps large pictures as files in a column."""
     import h5py
+    from PIL import Image
+
+    def file_of(picture):
+        buffer = io.BytesIO()
+        Image.fromarray(picture).save(buffer, "PNG")
+        return np.frombuffer(buffer.getvalue(), np.uint8)
 
     (root / "data").mkdir(parents=True)
     space = {"type": "Box", "low": [-1.0, -1.0], "high": [1.0, 1.0]}
@@ -171,6 +178,12 @@ def minari(root, frames, actions):
     with h5py.File(root / "data" / "main_data.hdf5", "w") as file:
         for n, episode in enumerate(frames):
             group = file.create_group(f"episode_{n}")
-            group["observations/pixels"] = episode
+            if encoded:
+                kind = h5py.vlen_dtype(np.uint8)
+                column = group.create_dataset("observations/pixels", len(episode), kind)
+                for row, picture in enumerate(episode):
+                    column[row] = file_of(picture)
+            else:
+                group["observations/pixels"] = episode
             group["actions"] = actions[n][: len(episode) - 1]
     return root

@@ -31,21 +31,21 @@ PUCK = """<mujoco>
   <motor joint="y" ctrlrange="-4 4"/>
 </actuator>
 </mujoco>"""
-LIMIT_N, STEPS, SUBSTEPS = 4.0, 50, 4
+LIMIT_N, STEPS, SUBSTEPS = 4.0, 60, 4
 CONFIG = """
 [encoder]
-embedding = 32
+embedding = 64
 hidden = 256
-steps = 150
+steps = 300
 batch_trajectories = 8
 [actor]
 hidden = 256
 epochs = 40
 [hierarchy]
-coarse_steps = 200
-flat_steps = 200
-medium_steps = 40
-low_steps = 40
+coarse_steps = 400
+flat_steps = 50
+medium_steps = 100
+low_steps = 100
 [protocol]
 bootstrap = 200
 """
@@ -86,7 +86,7 @@ def record(episodes, seed, exploration_n):
 @pytest.mark.slow
 def test_a_recorded_plant_is_learned_and_beats_holding_three_times(tmp_path, monkeypatch, capsys):
     shell = open_shell(tmp_path, monkeypatch, capsys)
-    np.savez(tmp_path / "train.npz", **record(28, 0, 1.5))
+    np.savez(tmp_path / "train.npz", **record(40, 0, 1.5))
     np.savez(tmp_path / "test.npz", **record(8, 1, 0.0))
     (tmp_path / "small.toml").write_text(CONFIG)
 
@@ -95,7 +95,7 @@ def test_a_recorded_plant_is_learned_and_beats_holding_three_times(tmp_path, mon
         assert outcome.code == 0, outcome
         return outcome.document
 
-    said = ("--fps", 1 / 0.02, "--limit", LIMIT_N, "--size", 48, 96, "--test", "test.npz")
+    said = ("--fps", 50, "--limit", LIMIT_N, "--size", 48, 96, "--test", "test.npz")
     imported = run("data", "import", "train.npz", *said, "--out", "d")
     assert imported["frame_shape"] == [48, 96, 3] and imported["limits"] == [LIMIT_N] * 2
     assert imported["states"] == [] and not imported["alignment"]["clear"]

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from hjepa_cli.config.schema import IDEAL_LINK, ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
@@ -97,9 +96,9 @@ class InFlight:
 
 def _empty_like(packets: Any, count: int) -> Any:
     shape = (count, *packets.shape[1:])
-    if isinstance(packets, Tensor):
-        return packets.new_empty(shape)
-    return np.empty(shape, packets.dtype)
+    if isinstance(packets, np.ndarray):
+        return np.empty(shape, packets.dtype)
+    return packets.new_empty(shape)  # a tensor: torch is not imported for its name
 
 
 class Downlink:

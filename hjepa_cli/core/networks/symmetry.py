@@ -194,7 +194,7 @@ class MirrorCentre(nn.Module):
         even, odd = z.chunk(2, dim=-1)
         # A batch and its mirror image have mean 0, and so has the running mean.
         both = self.odd(torch.cat([odd, -odd]))
-        return torch.cat([self.even(even), both[: len(z)]], dim=-1)
+        return torch.cat([self.even(even), both[: z.shape[0]]], dim=-1)
 
 
 def flatten_twins(x: Tensor) -> Tensor:

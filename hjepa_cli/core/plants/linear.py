@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import scipy.linalg
 
 from hjepa_cli.core.arrays import Floats
 
@@ -50,6 +49,8 @@ def lqr_gain(
     a: Floats, b: Floats, state_weights: Sequence[float], force_weights: Sequence[float]
 ) -> Floats:
     """Return the gain K [m, S] of u = −K x that minimises Σ xᵀQx + uᵀRu, Q and R diagonal."""
+    import scipy.linalg  # takes a third of a second, which a device on the wire need not wait
+
     q, r = np.diag(state_weights), np.diag(force_weights)
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     return np.asarray(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a))

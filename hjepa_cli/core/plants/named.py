@@ -173,6 +173,7 @@ class CartPole:
     """
 
     def __init__(self, preset: CartPolePlant | str, *, seed: int | None = None) -> None:
+
         self._poles = CartPoles(cart_pole(preset), 1)
         self.plant = self._poles.plant
         if seed is not None:

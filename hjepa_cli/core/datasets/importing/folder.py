@@ -5,17 +5,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hjepa_cli.core.datasets.importing import columns
 from hjepa_cli.core.datasets.importing.columns import Chosen, Table
 from hjepa_cli.core.datasets.importing.episode import Episode, Pictures, Recording
+from hjepa_cli.core.datasets.importing.pictures import decoded
 from hjepa_cli.errors import DataError, require
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LOSSY = (".jpg", ".jpeg", ".webp")
-MODES = {"L", "LA", "RGB", "RGBA", "1", "I;16", "F"}  # that numpy makes arrays of as we take them
 
 
 def read(directory: Path, chosen: Chosen) -> Recording:
@@ -99,15 +96,4 @@ def _beside(path: Path) -> list[Path]:
 
 def _stream(name: str, paths: Sequence[Path], start: int) -> Pictures:
     for row in range(start, len(paths)):
-        yield _picture(paths[row], f"{name}, row {row}")[None]
-
-
-def _picture(path: Path, where: str) -> NDArray[Any]:
-    """Return a picture [H, W] or [H, W, C]. Raises DataError where it does not decode."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image if image.mode in MODES else image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"{where}: {path} does not decode: {error}") from None
+        yield decoded(paths[row], f"{name}, row {row}")[None]

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hjepa_cli.core.datasets.importing import arrays
 from hjepa_cli.core.datasets.importing.episode import Recording
 from hjepa_cli.core.datasets.importing.npz import ABOUT, COLUMNS, exported
+from hjepa_cli.core.datasets.importing.pictures import decoded
 from hjepa_cli.errors import DataError, require
 
 PICTURES = ("pixels", "frames")
@@ -62,6 +64,7 @@ def read_minari(directory: Path) -> Recording:
         MissingInputError: h5py is not installed.
         DataError: the file has another layout, or no pictures.
     """
+    require("PIL", "pictures need Pillow", "import")
     with _opened(directory / MINARI_FILE) as file:
         numbers = sorted(int(name[8:]) for name in file if name.startswith("episode_"))
         groups = [file[f"episode_{number}"] for number in numbers]
@@ -70,7 +73,31 @@ def read_minari(directory: Path) -> Recording:
         pictures = [_pictures(group["observations"], directory) for group in groups]
         columns = {"actions": [group["actions"] for group in groups]}
         about: dict[str, Any] = {"format": "minari", "close": file.close, **_space(directory)}
-        return arrays.recording(pictures, columns, **about)
+        lossy = any(isinstance(some, _Encoded) for some in pictures)
+        return arrays.recording(pictures, columns, lossy=lossy, **about)
+
+
+class _Encoded:
+    """Pictures that lie in a column as files, JPEG of Minari's, are rows."""
+
+    def __init__(self, column: Any) -> None:
+        self._column = column
+        self.shape = column.shape
+
+    @property
+    def holds_pictures(self) -> bool:
+        """Tell whether the column holds bytes of any length, and not numbers."""
+        return bool(self._column.dtype.hasobject and self.shape[0])
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        start, stop, _ = rows.indices(self.shape[0])
+        files = self._column[start:stop]
+        name = self._column.name.strip("/").partition("/")[0].replace("_", " ")
+        found = [
+            decoded(bytes(file), f"{name}, row {row}")
+            for row, file in enumerate(files, start=start)
+        ]
+        return np.stack(found)
 
 
 def _pictures(observations: Any, directory: Path) -> Any:
@@ -80,6 +107,8 @@ def _pictures(observations: Any, directory: Path) -> Any:
     else:
         named = {"observations": observations}
     chosen = {name: of for name, of in named.items() if len(getattr(of, "shape", ())) >= 3}
+    encoded = {name: _Encoded(of) for name, of in named.items() if getattr(of, "ndim", 0) == 1}
+    chosen |= {name: of for name, of in encoded.items() if of.holds_pictures}
     for name in (*MINARI_PICTURES, *chosen):
         if name in chosen:
             return chosen[name]

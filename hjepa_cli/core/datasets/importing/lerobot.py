@@ -4,7 +4,6 @@ Version 2 has a table and a film for each episode, version 3 puts several into o
 ``meta/episodes`` where each begins.
 """
 
-import io
 import json
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -12,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hjepa_cli.core.datasets.importing import video
 from hjepa_cli.core.datasets.importing.columns import Chosen
 from hjepa_cli.core.datasets.importing.episode import Entries, Episode, Pictures, Recording, table
 from hjepa_cli.core.datasets.importing.folder import inside
+from hjepa_cli.core.datasets.importing.pictures import decoded
 from hjepa_cli.errors import DataError, UsageError, require
 
 INFO = Path("meta") / "info.json"
@@ -168,14 +167,7 @@ def _of_film(path: Path, name: str, count: int, from_s: float, start: int) -> Pi
 def _of_table(column: Any, name: str, start: int) -> Pictures:
     """Yield pictures that lie encoded in a column."""
     for row in range(start, len(column)):
-        yield _decoded(column[row].as_py(), f"{name}, row {row}")[None]
-
-
-def _decoded(value: Any, where: str) -> NDArray[Any]:
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(value["bytes"])) as image:
-            return np.asarray(image.convert("RGB"))
-    except (OSError, ValueError, TypeError, KeyError, SyntaxError) as error:
-        raise DataError(f"{where}: the picture does not decode: {error}") from None
+        value, where = column[row].as_py(), f"{name}, row {row}"
+        if not (isinstance(value, dict) and isinstance(value.get("bytes"), bytes)):
+            raise DataError(f"{where}: there is no picture in the table")
+        yield decoded(value["bytes"], where)[None]

@@ -1,5 +1,7 @@
 """Pictures of any usual kind become uint8 with one channel or three."""
 
+import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,24 @@ from hjepa_cli.core.arrays import Pixels
 from hjepa_cli.errors import DataError
 
 CHANNELS = (1, 3, 4)
+MODES = {"L", "RGB", "RGBA", "1", "I;16", "F"}  # that numpy makes arrays of as we take them
 SIDES_PX = (1, 16_384)
+
+
+def decoded(source: Path | bytes, where: str) -> NDArray[Any]:
+    """Return a picture file, or its bytes, as [H, W] or [H, W, C].
+
+    Raises:
+        DataError: it does not decode; the message says ``where`` it is.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as image:
+            return np.asarray(image if image.mode in MODES else image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        named = source if isinstance(source, Path) else "the picture"
+        raise DataError(f"{where}: {named} does not decode: {error}") from None
 
 
 def as_pixels(block: NDArray[Any], name: str, row: int) -> tuple[Pixels, set[str]]:

@@ -1,0 +1,144 @@
+"""A bundle is what ``hjepa export`` writes: networks for a runtime without torch, and a manifest.
+
+``manifest.json`` is canonical JSON and says all that a device and a controller must agree on; its
+sha256 is the model's digest in every hello. Networks are checked against the manifest's digests
+before a runtime sees a byte of them.
+"""
+
+import dataclasses
+import hashlib
+import math
+from pathlib import Path
+from typing import Any
+
+from hjepa_cli.errors import DataError, MissingInputError, shell
+from hjepa_cli.storage import files
+
+SCHEMA = 1
+MANIFEST = "manifest.json"
+CHECK = "check.json"
+NETWORKS = ("encoder", "encoder-int8", "planner", "coarse", "fine", "actor")
+BUCKETS = (1, 4, 16, 64)  # batches that runtimes with fixed shapes compile
+_LIMIT_BYTES = 512 * 2**20
+
+
+@dataclasses.dataclass(frozen=True)
+class Bundle:
+    """A verified bundle.
+
+    Attributes:
+        directory: where it lies.
+        manifest: as written.
+        digest: sha256 of the manifest, 32 bytes.
+    """
+
+    directory: Path
+    manifest: dict[str, Any]
+    digest: bytes
+
+    @property
+    def plant(self) -> str:
+        """Return the name of the plant that the model was trained on."""
+        return str(self.manifest["plant"])
+
+    @property
+    def embedding(self) -> int:
+        """Return D."""
+        return int(self.manifest["embedding"])
+
+    @property
+    def frames(self) -> int:
+        """Return κ, the pictures that the encoder sees at once."""
+        return int(self.manifest["frames"])
+
+    @property
+    def axes(self) -> int:
+        """Return m, the forces of a step."""
+        return math.prod(self.manifest["action_shape"])
+
+    @property
+    def stride(self) -> int:
+        """Return the control steps that the planner plans at a time."""
+        return int(self.manifest["stride"])
+
+    @property
+    def force_limit_n(self) -> float:
+        """Return the limit that forces lie within."""
+        return float(self.manifest["force_limit_n"])
+
+    @property
+    def step_s(self) -> float:
+        """Return the plant's control step."""
+        return float(self.manifest["step_s"])
+
+    def network(self, name: str) -> Path:
+        """Return the file of a network's graph, after checking graph and weights.
+
+        Raises:
+            DataError: they are others, or there is no such network.
+        """
+        entry = self.manifest["networks"].get(name)
+        if entry is None:
+            raise DataError(f"{self.directory} holds no network '{name}'", hint=_again(self))
+        for file, digest in entry["files"].items():
+            path = self.directory / file
+            data = files.read_bytes(path, limit=_LIMIT_BYTES)
+            if hashlib.sha256(data).hexdigest() != digest:
+                raise DataError(f"{path} is not the file that {MANIFEST} names", hint=_again(self))
+        return self.directory / f"{name}.onnx"
+
+    def verify(self) -> None:
+        """Check every network. Raises as :meth:`network`."""
+        for name in self.manifest["networks"]:
+            self.network(name)
+
+
+def files_of(name: str) -> tuple[str, str]:
+    """Return the files of a network: its graph, and its weights, which a runtime maps."""
+    return f"{name}.onnx", f"{name}.bin"
+
+
+def _again(bundle: Bundle) -> str:
+    return f"copy the bundle again, or: {exported_by(bundle.directory)}"
+
+
+def exported_by(directory: Path) -> str:
+    """Return the command that writes a bundle."""
+    return shell(["hjepa", "export", "MODEL", "--to", directory])
+
+
+def open_bundle(directory: Path) -> Bundle:
+    """Read and check the manifest of a bundle.
+
+    Raises:
+        MissingInputError: there is no bundle.
+        DataError: it is damaged, or of a newer version.
+    """
+    path = directory / MANIFEST
+    if not path.is_file():
+        raise MissingInputError(f"{directory} holds no exported model", hint=exported_by(directory))
+    data = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES)
+    try:
+        manifest = files.parse_json(data)
+    except ValueError as error:
+        raise DataError(f"{path} is not valid JSON: {error}") from None
+    files.check_schema(manifest.get("schema"), SCHEMA, str(path))
+    bundle = Bundle(directory, manifest, hashlib.sha256(data).digest())
+    try:
+        networks, shape = manifest["networks"], manifest["action_shape"]
+        sizes = [manifest[name] for name in ("embedding", "frames", "stride")]
+        good = (
+            all(type(size) is int and 0 < size <= 65_535 for size in sizes)
+            and all(isinstance(axis, int) and axis > 0 for axis in shape)
+            and bundle.force_limit_n > 0
+            and bundle.step_s > 0
+            and 0 < len(bundle.plant.encode()) <= 16
+            and isinstance(manifest["camera"], dict)
+            and set(networks) <= set(NETWORKS)
+            and all(set(entry["files"]) == set(files_of(name)) for name, entry in networks.items())
+        )
+    except (KeyError, TypeError, ValueError):
+        good = False
+    if not good:
+        raise DataError(f"{path} lacks entries or has malformed ones", hint=_again(bundle))
+    return bundle

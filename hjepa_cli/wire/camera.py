@@ -1,0 +1,212 @@
+"""A camera gives a device its pictures; three kinds, and a check that every one goes through.
+
+A camera of your own has ``read`` and ``close``. What the encoder has not been trained on it must
+not see: pictures of another size or type are refused, and a picture that never changes is a camera
+that hangs.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from hjepa_cli.core.arrays import Pixels
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, HEIGHT_PX, WIDTH_PX
+from hjepa_cli.errors import DataError, MissingInputError, Unavailable, UsageError, require
+
+FROZEN = 1000  # equal pictures in a row
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+
+Crop = tuple[int, int, int, int]
+
+
+class Camera(Protocol):
+    """It looks at a plant."""
+
+    def read(self) -> Pixels | None:
+        """Return the newest picture, RGB uint8 [64, 128, 3]; ``None`` at the end of a recording.
+
+        Raises:
+            Unavailable: there is none.
+        """
+
+    def close(self) -> None:
+        """Give the camera back."""
+
+
+class Watched:
+    """It keeps the newest κ pictures of a camera, after looking at each.
+
+    Args:
+        camera: to read from.
+        frames: κ.
+    """
+
+    def __init__(self, camera: Camera, frames: int) -> None:
+        self._camera = camera
+        self._seen: deque[Pixels] = deque(maxlen=frames)
+        self._equal = 0
+
+    def read(self) -> bool:
+        """Take a picture; say whether there was one.
+
+        Raises:
+            DataError: it has another size or type.
+            Unavailable: there is none, or it has been the same for too long.
+        """
+        picture = self._camera.read()
+        if picture is None:
+            return False
+        shape, dtype = getattr(picture, "shape", None), getattr(picture, "dtype", None)
+        if shape != FRAME_SHAPE or dtype != np.uint8:
+            raise DataError(
+                f"the camera gives {shape} of {dtype}; the model sees {FRAME_SHAPE} of uint8, RGB",
+                hint="--crop X,Y,WIDTH,HEIGHT with a part twice as wide as high",
+            )
+        same = bool(self._seen) and np.array_equal(picture, self._seen[-1])
+        self._equal = self._equal + 1 if same else 0
+        if self._equal >= FROZEN:
+            raise Unavailable(
+                f"the camera is frozen: {FROZEN} equal pictures in a row",
+                hint="look at its cable and its driver, then start the device again",
+            )
+        while len(self._seen) < self._seen.maxlen - 1:  # type: ignore[operator]
+            self._seen.append(picture)  # of before it was switched on: copies of the first
+        self._seen.append(picture)
+        return True
+
+    @property
+    def frames(self) -> Pixels:
+        """Return the pictures [1, κ, 64, 128, 3], the newest last."""
+        return np.stack(self._seen)[None]
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._camera.close()
+
+
+class Replay:
+    """It reads a directory of pictures, in the order of their names, once or for ever."""
+
+    def __init__(self, directory: Path, crop: Crop | None = None, *, repeat: bool = False) -> None:
+        require("PIL", "replaying pictures needs Pillow", "plot")
+        names = sorted(path for path in directory.iterdir() if path.suffix.lower() in PICTURES)
+        if not names:
+            raise MissingInputError(
+                f"{directory} holds no pictures ({', '.join(PICTURES)})",
+                hint="name a directory of pictures, a video file, a camera's number, or sim",
+            )
+        self._paths: Iterator[Path] = iter(_endless(names) if repeat else names)
+        self._crop = crop
+
+    def read(self) -> Pixels | None:
+        """Return the next picture."""
+        from PIL import Image
+
+        path = next(self._paths, None)
+        if path is None:
+            return None
+        try:
+            with Image.open(path) as file:
+                return fitted(np.asarray(file.convert("RGB")), self._crop)
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path} is no picture: {error}") from None
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class OpenCv:
+    """It reads a camera or a video file through OpenCV; ``source`` is its number or the file."""
+
+    def __init__(self, source: int | str, crop: Crop | None = None) -> None:
+        require("cv2", "a camera or a video needs OpenCV", "camera")
+        import cv2
+
+        self._video, self._source, self._crop = cv2.VideoCapture(source), source, crop
+        if not self._video.isOpened():
+            raise Unavailable(
+                f"camera {source} cannot be opened",
+                hint="name a camera's number, a video file, a directory of pictures, or sim",
+            )
+        self._some = False
+
+    def read(self) -> Pixels | None:
+        """Return the next picture, which the camera has to finish first."""
+        import cv2
+
+        good, picture = self._video.read()
+        if not good:
+            if self._some and isinstance(self._source, str):
+                return None
+            raise Unavailable(f"camera {self._source} gives no picture")
+        self._some = True
+        return fitted(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), self._crop)
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._video.release()
+
+
+def fitted(picture: Pixels, crop: Crop | None) -> Pixels:
+    """Cut a part (x, y, width, height) out of a picture, and shrink it to the encoder's size.
+
+    Pixels are averaged over areas, as the simulated camera does. Without a crop the picture stays.
+
+    Raises:
+        DataError: the part is not in the picture, or not a whole multiple of 128 × 64.
+    """
+    if crop is None:
+        return picture
+    x, y, width, height = crop
+    part = picture[y : y + height, x : x + width]
+    scale = width // WIDTH_PX
+    if part.shape[:2] != (height, width) or (height, width) != (
+        *(scale * HEIGHT_PX, scale * WIDTH_PX),
+    ):
+        raise DataError(
+            f"crop {x},{y},{width},{height} of pictures of {picture.shape[1]} × "
+            f"{picture.shape[0]}: it must lie inside, with a width of 128, 256, 384 … and half "
+            "that height"
+        )
+    blocks = part.reshape(HEIGHT_PX, scale, WIDTH_PX, scale, 3).astype(np.float32)
+    return np.asarray(np.rint(blocks.mean(axis=(1, 3))), np.uint8)
+
+
+def parse_crop(text: str | None) -> Crop | None:
+    """Return the numbers of ``"X,Y,WIDTH,HEIGHT"``. Raises UsageError."""
+    if text is None:
+        return None
+    numbers = [int(part) for part in text.split(",") if part.strip().isdigit()]
+    if len(numbers) != 4 or text.count(",") != 3 or numbers[2] < WIDTH_PX:
+        raise UsageError(f"--crop {text}: expected X,Y,WIDTH,HEIGHT in pixels, as 0,0,256,128")
+    x, y, width, height = numbers
+    return x, y, width, height
+
+
+def open_camera(name: str, crop: Crop | None, simulated: Callable[[], Camera]) -> Camera:
+    """Return the camera called so: ``sim``, a number, a directory of pictures, or a video file.
+
+    Raises:
+        UsageError: none of these.
+        MissingInputError, Unavailable: it is not there.
+    """
+    if name == "sim":
+        return simulated()
+    if name.isascii() and name.isdigit():
+        return OpenCv(int(name), crop)
+    path = Path(name)
+    if path.is_dir():
+        return Replay(path, crop)
+    if path.is_file():
+        return OpenCv(str(path), crop)
+    raise UsageError(
+        f"--camera {name}: expected sim, a camera's number, a directory of pictures or a video file"
+    )
+
+
+def _endless(paths: list[Path]) -> Iterator[Path]:
+    while True:
+        yield from paths

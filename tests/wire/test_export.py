@@ -1,0 +1,177 @@
+"""What is exported computes what torch computes, and is refused once a byte of it changes."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from hjepa_cli.errors import DataError, MissingInputError, NumericalError, UsageError
+from hjepa_cli.wire.bundle import MANIFEST, open_bundle
+
+pytest.importorskip("onnxruntime")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def copy(exported, tmp_path_factory):
+    def make():
+        target = tmp_path_factory.mktemp("copy") / "model"
+        return shutil.copytree(exported, target)
+
+    return make
+
+
+def test_the_check_measures_what_the_issue_asks(exported, checkpoint):
+    from hjepa_cli.wire import export
+
+    measured = export.check(open_bundle(exported), checkpoint)
+    assert max(measured["max_error"].values()) <= 1e-5
+    assert measured["int8"]["rms_z"] <= 0.015 and measured["int8"]["rms_force_n"] <= 0.05
+    assert json.loads((exported / "check.json").read_text())["n"] == measured["n"]
+
+
+def test_the_check_finds_another_network(copy, checkpoint):
+    """The actor's sign is turned, its digest made good: the numbers alone tell."""
+    import hashlib
+
+    import onnx
+    from onnx import numpy_helper
+
+    from hjepa_cli.wire import export
+
+    directory = copy()
+    model = onnx.load(directory / "actor.onnx")
+    last = max(
+        (one for one in model.graph.initializer if len(one.dims) == 2), key=lambda one: one.dims[1]
+    )
+    last.CopyFrom(numpy_helper.from_array(-numpy_helper.to_array(last), last.name))
+    data = model.SerializeToString()
+    (directory / "actor.onnx").write_bytes(data)
+    manifest = json.loads((directory / MANIFEST).read_text())
+    manifest["networks"]["actor"]["files"]["actor.onnx"] = hashlib.sha256(data).hexdigest()
+    (directory / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(NumericalError, match="force"):
+        export.check(open_bundle(directory), checkpoint)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_any_batch_gives_every_row_its_own_result(exported, backend):
+    pytest.importorskip(backend)
+    from hjepa_cli.wire.runtime import Runtime
+
+    runtime = Runtime(open_bundle(exported), backend)
+    z = np.random.default_rng(0).normal(size=(70, 256)).astype(np.float32)
+    z *= 16 / np.linalg.norm(z, axis=1, keepdims=True)
+    forces_n, z_next = runtime.plan(z)
+    assert forces_n.shape == (70, 4, 1) and z_next.shape == (70, 256)
+    for rows in (1, 2, 5, 17):
+        few_n, few = runtime.plan(z[:rows])
+        np.testing.assert_allclose(few_n, forces_n[:rows], atol=1e-5)
+        np.testing.assert_allclose(few, z_next[:rows], atol=1e-5)
+
+
+def test_follow_is_that_of_the_simulator(exported, checkpoint):
+    """Against :func:`planners.follow` in torch, ages of all kinds, 0 and rests of strides too."""
+    from hjepa_cli.core.control.planners import Hierarchy
+    from hjepa_cli.wire.export import load_fp32
+    from hjepa_cli.wire.runtime import Runtime
+
+    random = np.random.default_rng(1)
+    z = random.normal(size=(12, 256)).astype(np.float32)
+    z *= 16 / np.linalg.norm(z, axis=1, keepdims=True)
+    ages = np.arange(12)
+    forces_n = random.uniform(-20, 20, (12, 11, 1)).astype(np.float32)
+    planner = Hierarchy(load_fp32(checkpoint))
+    with torch.inference_mode():
+        expected = planner.follow(torch.from_numpy(z), torch.from_numpy(forces_n[..., 0]), ages)
+    found = Runtime(open_bundle(exported)).follow(z, forces_n, ages)
+    np.testing.assert_allclose(found, expected.numpy(), atol=1e-5)
+    np.testing.assert_array_equal(found[0], z[0])
+
+
+@pytest.mark.parametrize("file", ["planner.onnx", "planner.bin"])
+def test_a_changed_byte_is_refused(copy, file):
+    from hjepa_cli.wire.runtime import Runtime
+
+    directory = copy()
+    data = bytearray((directory / file).read_bytes())
+    data[len(data) // 2] ^= 1
+    (directory / file).write_bytes(bytes(data))
+    with pytest.raises(DataError, match=file):
+        Runtime(open_bundle(directory)).warm_up("planner")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"plant": ""}, {"plant": "a name that is far too long"}, {"embedding": 0}, {"stride": "4"},
+        {"force_limit_n": -1}, {"networks": {"encoder": {"files": {"../../etc/passwd": ""}}}},
+        {"networks": {"shell": {"files": {"shell.onnx": "", "shell.bin": ""}}}},
+        {"camera": None}, {"action_shape": [0]},
+    ],
+)  # fmt: skip
+def test_manifests_that_say_nonsense_are_refused(copy, change):
+    directory = copy()
+    manifest = json.loads((directory / MANIFEST).read_text())
+    (directory / MANIFEST).write_text(json.dumps(manifest | change))
+    with pytest.raises(DataError, match="malformed"):
+        open_bundle(directory)
+
+
+def test_there_must_be_a_whole_manifest_of_this_version(copy, tmp_path):
+    with pytest.raises(MissingInputError, match="no exported model"):
+        open_bundle(tmp_path)
+    directory = copy()
+    (directory / MANIFEST).write_text('{"schema": 99}')
+    with pytest.raises(DataError, match="schema 99"):
+        open_bundle(directory)
+    (directory / MANIFEST).write_text("{")
+    with pytest.raises(DataError, match="not valid JSON"):
+        open_bundle(directory)
+
+
+def test_models_that_plan_nothing_and_other_directories_are_refused(tmp_path):
+    from hjepa_cli.storage import zoo
+    from hjepa_cli.wire.export import export
+
+    with pytest.raises(UsageError, match="plans no strides"):
+        export(zoo.resolve_model("desktop-reflex"), tmp_path / "new", None)
+    with pytest.raises(UsageError, match="choose hjepa"):
+        export(zoo.resolve_model("desktop-h4m2l1"), tmp_path / "new", "oracle")
+    (tmp_path / "letter.txt").write_text("mine")
+    with pytest.raises(UsageError, match=r"letter\.txt"):
+        export(zoo.resolve_model("desktop-h4m2l1"), tmp_path, None)
+
+
+def test_lockstep_is_the_simulator(exported):
+    """Two loops with the same networks: over the wire and in the simulator, lost downlinks too.
+
+    Forces travel as float32, which the simulator's planner makes them too: states are equal but
+    for rounding, until a grey level rounds to another side.
+    """
+    import dataclasses
+
+    from hjepa_cli.config.schema import ProtocolSettings
+    from hjepa_cli.core.control.loop import Draws, gap_schedule
+    from hjepa_cli.core.plants.named import plant
+    from hjepa_cli.stages.bench_link import Exported, simulated
+    from hjepa_cli.wire.auth import NO_KEY
+    from hjepa_cli.wire.bench import Fleet, lockstep
+    from hjepa_cli.wire.controller import Controller
+    from hjepa_cli.wire.runtime import Runtime
+
+    bundle, kind, devices, steps = open_bundle(exported), plant("desktop"), 4, 120
+    runtime = Runtime(bundle)
+    protocol = dataclasses.replace(ProtocolSettings(), warmup_steps=0, steps=steps)
+    draws, sent = Draws.make(protocol, devices, 3), gap_schedule(30, steps, devices)
+    camera = kind.camera()
+    fleet = Fleet(bundle, runtime, kind, camera, draws, sent, NO_KEY, 0.005)
+    wired = lockstep(fleet, Controller(bundle, runtime, NO_KEY), draws.link)
+    states = np.empty_like(wired.states)
+    planner = Exported(runtime, ())
+    score = simulated(runtime, planner, kind, camera, draws, sent, states, lambda: None)
+    assert wired.missing == 0 and wired.late_answers == 0
+    np.testing.assert_allclose(wired.states[..., 2], states[..., 2], atol=1e-6)
+    np.testing.assert_allclose(wired.score, score, atol=0.02)

@@ -1,0 +1,138 @@
+"""Cameras, actuators and addresses: what they give, and what they are refused for."""
+
+import os
+import pty
+
+import numpy as np
+import pytest
+
+from hjepa_cli.core.plants.frames import FRAME_SHAPE
+from hjepa_cli.errors import DataError, MissingInputError, Unavailable, UsageError
+from hjepa_cli.wire import camera as cameras
+from hjepa_cli.wire.actuator import open_actuator
+from hjepa_cli.wire.camera import Watched, fitted, open_camera, parse_crop
+from hjepa_cli.wire.server import is_loopback, open_socket, parse_address, resolve
+
+
+class Pictures:
+    def __init__(self, *pictures):
+        self._left = list(pictures)
+
+    def read(self):
+        return self._left.pop(0) if self._left else None
+
+    def close(self):
+        pass
+
+
+def picture(value):
+    return np.full(FRAME_SHAPE, value, np.uint8)
+
+
+def test_the_encoder_sees_the_newest_pictures_and_copies_of_the_first():
+    watched = Watched(Pictures(picture(1), picture(2), picture(3)), 2)
+    seen = []
+    while watched.read():
+        seen.append(watched.frames[0, :, 0, 0, 0].tolist())
+    assert seen == [[1, 1], [1, 2], [2, 3]]
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros((480, 640, 3), np.uint8),
+        np.zeros(FRAME_SHAPE, np.float32),
+        np.zeros(FRAME_SHAPE[:2], np.uint8),
+        "no picture",
+    ],
+)
+def test_pictures_of_another_size_or_type_are_refused(bad):
+    with pytest.raises(DataError, match="the model sees"):
+        Watched(Pictures(bad), 2).read()
+
+
+def test_a_frozen_camera_is_noticed():
+    watched = Watched(Pictures(*[picture(1)] * (cameras.FROZEN + 2)), 2)
+    with pytest.raises(Unavailable, match="frozen"):
+        while watched.read():
+            pass
+
+
+def test_a_crop_averages_areas():
+    random = np.random.default_rng(0)
+    wide = random.integers(0, 256, (200, 300, 3), dtype=np.uint8)
+    found = fitted(wide, (10, 20, 256, 128))
+    for row, column in ((0, 0), (63, 127), (17, 40)):
+        block = wide[20 + 2 * row : 22 + 2 * row, 10 + 2 * column : 12 + 2 * column]
+        assert np.abs(found[row, column] - block.mean(axis=(0, 1))).max() <= 0.5
+    for crop in ((0, 0, 300, 150), (100, 0, 256, 128), (0, 0, 256, 100)):
+        with pytest.raises(DataError, match="crop"):
+            fitted(wide, crop)
+    assert parse_crop(" 1,2,256,128") == (1, 2, 256, 128) and parse_crop(None) is None
+    for text in ("1,2,3", "a,b,c,d", "0,0,64,32", "-1,0,256,128"):
+        with pytest.raises(UsageError, match="--crop"):
+            parse_crop(text)
+
+
+def test_a_directory_of_pictures_is_replayed_in_order(tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    for value in (3, 1, 2):
+        image.fromarray(picture(value)).save(tmp_path / f"{value}.png")
+    replay = open_camera(str(tmp_path), None, lambda: None)
+    assert [int(replay.read()[0, 0, 0]) for _ in range(3)] == [1, 2, 3]
+    assert replay.read() is None
+    (tmp_path / "0.png").write_bytes(b"no picture")
+    with pytest.raises(DataError, match=r"0\.png"):
+        open_camera(str(tmp_path), None, lambda: None).read()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(MissingInputError, match="no pictures"):
+        open_camera(str(empty), None, lambda: None)
+    with pytest.raises(UsageError, match="--camera nonsense"):
+        open_camera("nonsense", None, lambda: None)
+
+
+def test_the_serial_cart_pole_writes_newton_and_leaves_none():
+    ours, theirs = pty.openpty()
+    actuator = open_actuator(f"serial:{os.ttyname(theirs)}", 1)
+    actuator.play(np.array([-2.5], np.float32))
+    actuator.close()
+    expected, found = b"u -2.500\n" + 3 * b"u +0.000\n", b""
+    while len(found) < len(expected):
+        found += os.read(ours, 100)
+    assert found == expected
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_actuators_that_are_none(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(Unavailable, match="no serial port"):
+        open_actuator(f"serial:{tmp_path / 'file'}", 1)
+    with pytest.raises(Unavailable, match="nowhere"):
+        open_actuator("serial:/dev/nowhere", 1)
+    for name in ("serial:", "wheel"):
+        with pytest.raises(UsageError, match="--actuator"):
+            open_actuator(name, 1)
+    with pytest.raises(UsageError, match="has 2"):
+        open_actuator("serial:/dev/ttyUSB0", 2)
+
+
+def test_addresses():
+    assert parse_address("127.0.0.1:80", "--bind") == ("127.0.0.1", 80)
+    assert parse_address("[::1]:80", "--bind") == ("::1", 80)
+    assert parse_address(":80", "--bind") == ("127.0.0.1", 80)
+    assert parse_address("80", "--bind") == ("127.0.0.1", 80)
+    for text in ("", "host", "host:", "host:a", "host:70000", "host:-1"):
+        with pytest.raises(UsageError, match="HOST:PORT"):
+            parse_address(text, "--bind")
+    assert is_loopback(("127.3.4.5", 1)) and is_loopback(("::1", 1, 0, 0))
+    assert not is_loopback(("0.0.0.0", 1)) and not is_loopback(("10.0.0.1", 1))
+    with pytest.raises(Unavailable, match="--server"):
+        resolve(("no host at all", 1), "--server")
+
+
+def test_a_taken_port_is_named():
+    with open_socket(("127.0.0.1", 0)) as taken:
+        with pytest.raises(Unavailable, match=r"--bind 127\.0\.0\.1"):
+            open_socket(taken.getsockname())
