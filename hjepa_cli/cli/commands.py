@@ -279,7 +279,7 @@ COMMANDS = (
         "Drive devices over UDP with an exported model.",
         Imported("hjepa_cli.stages.serve:run"),
         (
-            *("model", "bind", "key", "max_devices", "timeout_s", "metrics", "websocket"),
+            *("model", "bind", "key:wire", "max_devices", "timeout_s", "metrics", "websocket"),
             *("backend", "for_s"),
         ),
         plan=Imported("hjepa_cli.stages.serve:plan"),
@@ -290,8 +290,8 @@ COMMANDS = (
         "Be a device: look, encode, send, and play the forces that come back.",
         Imported("hjepa_cli.stages.device:run"),
         (
-            *("model", "server", "key", "number", "camera", "crop", "actuator", "period_ms"),
-            *("gap_steps:wire", "innovation", "longest_steps", "watchdog_ms", "local"),
+            *("model", "server", "key:wire", "number", "camera:wire", "crop", "actuator"),
+            *("period_ms", "gap_steps:wire", "innovation", "longest_steps", "watchdog_ms", "local"),
             *("stop_after_s", "steps:wire", "precision", "backend", *RESOLVED),
         ),
         check=_one_rule,

@@ -41,8 +41,8 @@ def execute(command: Command, given: Given) -> None:
             plan = getattr(command.plan, "function", command.plan)
             parameters = inspect.signature(plan).parameters
             takes_all = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
-            further = inputs.keys() - {"screen"} if takes_all else set()
-            wanted = inputs.keys() & (parameters.keys() | further)
+            wanted = [name for name in inputs if name in parameters or takes_all]
+            wanted = [name for name in wanted if name != "screen" or name in parameters]
             planned = plan(**{name: inputs[name] for name in wanted})
             if not isinstance(planned, Plan):
                 raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")

@@ -403,7 +403,7 @@ _WIRE = {
     "precision": Input(Literal["fp32", "int8"], "--precision", "Of the encoder.", default="fp32"),
     "bind": _address("--bind", "Address to serve on; port 0 takes any.", "127.0.0.1:4747"),
     "server": _address("--server", "Address of hjepa serve, or of a relay.", "127.0.0.1:4747"),
-    "key": Input(
+    "key:wire": Input(
         Path,
         "--key",
         "File with the key that server and devices share; serve makes it where there is none. "
@@ -424,7 +424,7 @@ _WIRE = {
         "--number",
         "The device's own number; without it a random one.",
     ),
-    "camera": Input(
+    "camera:wire": Input(
         str,
         "--camera",
         "sim, a camera's number, a directory of pictures, or a video file.",

@@ -138,7 +138,7 @@ def test_models_that_plan_nothing_and_other_directories_are_refused(tmp_path):
 
     with pytest.raises(UsageError, match="plans no strides"):
         export(zoo.resolve_model("desktop-reflex"), tmp_path / "new", None)
-    with pytest.raises(UsageError, match="choose hjepa"):
+    with pytest.raises(UsageError, match="choose from hjepa"):
         export(zoo.resolve_model("desktop-h4m2l1"), tmp_path / "new", "oracle")
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(UsageError, match=r"letter\.txt"):

@@ -117,8 +117,7 @@ def write_npz(
         for name, array in arrays.items():
             put(name, iter([array]), array.shape)
         if pixels is not None:
-            rows = len(next(iter(values.values())))  # of the first column
-            put("pixels", pixels, (rows, *frame_shape))
+            put("pixels", pixels, (len(next(iter(values.values()))), *frame_shape))
 
 
 def blocks(split: Trajectories, frames: Frames, tick: Callable[[int], None]) -> Iterator[Any]:
