@@ -169,7 +169,7 @@ def _layers(
         layers.append(Layer(f"preset {preset}", values))
     plants = [flags.get("plant"), *(one.values.get("plant") for one in reversed([*layers, *file]))]
     plant = next(one for one in plants if one is not None)
-    if law := _control_laws().get(plant):
+    if law := _control_laws().get(str(plant)):
         layers.insert(1, Layer(f"tuned law of {plant}", {"control": law}))
     if protocol == "paper":
         layers += [Layer("protocol paper", {"protocol": values}) for values in paper]

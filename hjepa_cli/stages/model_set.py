@@ -195,8 +195,14 @@ def open_model_set(
 
 
 def under_law_of(model: Model, settings: Settings) -> Settings:
-    """Return settings with the law that a model learned, and its pictures, for all beside it."""
-    return brought_along(settings, model.metadata["settings"], model.digest)
+    """Return settings with the law that a model learned, and its pictures, for all beside it.
+
+    A ceiling is nobody's to learn: that of the settings stays where the model brings none.
+    """
+    found = brought_along(settings, model.metadata["settings"], model.digest)
+    ceiling = found.control.ceiling_gains_n or settings.control.ceiling_gains_n
+    control = dataclasses.replace(found.control, ceiling_gains_n=ceiling)
+    return dataclasses.replace(found, control=control)
 
 
 def how_to_train(method: str, settings: Settings) -> str:

@@ -142,7 +142,7 @@ def test_names_that_no_list_flag_or_path_can_carry_are_refused(shell, text, name
         (LAW, "axis=GAP", 'axis="gap"', "axis = 'gap' is no Axis"),
         (LAW, "devices=devices", "devices=3", "devices = 3 is no function"),
         (LAW, '"in every other slot"', "None", "help = None is no str"),
-        (METHOD, '"embedding", build', '"embeding", build', "did you mean 'embedding'?"),
+        (METHOD, '"embedding",', '"embeding",', "did you mean 'embedding'?"),
         (METHOD, "offered=of_hierarchy", "offered=None", "offered = None is no function"),
         (METHOD, "fitted=True", "fitted='yes'", "fitted = 'yes' is no bool"),
         (PHY, "layer=layer", "layer=3", "layer = 3 is no function"),
@@ -218,8 +218,8 @@ def test_a_stage_that_returns_something_else_is_named(shell, old, new, flags, sa
         ("None", "devices(…) = None"),
         ("float('nan')", "devices(…) = nan"),
         ("2.5", "devices(…) = 2.5"),
-        ("1 / 0", "plugin mine.py:7: ZeroDivisionError: division by zero"),
-        ("link.no_such", "plugin mine.py:7: AttributeError"),
+        ("1 / 0", "plugin mine.py:9: ZeroDivisionError: division by zero"),
+        ("link.no_such", "plugin mine.py:9: AttributeError"),
     ],
 )
 def test_a_law_that_counts_wrong_is_named(shell, value, says):
@@ -235,7 +235,7 @@ def test_a_law_that_counts_wrong_is_named(shell, value, says):
 @pytest.mark.parametrize(
     ("score", "says"),
     [
-        ("view.no_such", "plugin mine.py:6: AttributeError"),
+        ("view.no_such", "plugin mine.py:7: AttributeError"),
         ("view.age[:-1] * 1.0", "scheduler 'patient': score(…) is ("),
         ("view.age * np.nan", "score(…) is NaN for device 0"),
         ("None", "score(…) is () of object"),

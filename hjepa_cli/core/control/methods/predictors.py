@@ -84,7 +84,7 @@ HJEPA_FUSED = predictor(
     fused=True,
     offered=lambda architecture, plant: bool(architecture.get("fusion")),
     trained_by=training("train-fusion"),
-    style=Style("#0072B2", "P", ":", size=7.0),
+    style=Style("#0072B2", "H", ":", size=7.0),
 )
 
 _STYLES = {  # of the depths that the paper compares

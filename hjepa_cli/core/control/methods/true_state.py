@@ -71,5 +71,5 @@ HOLD_TRUE = _method("hold-true", Style("#7F7F7F", "v", ":", hollow=True, size=6.
 ZERO_TRUE = _method("zero-true", Style("#7F7F7F", "D", DASH_DOT_DOT, hollow=True, size=6.5))
 OPTIMAL = _method("optimal", Style("#000000", "x", ":"), needs_link=False, compared=True)
 ORACLE = _method("oracle", Style("#000000", "o", "-", hollow=True, size=8.5), compared=True)
-ORACLE_TEACHER = _method("oracle-teacher", Style("#7F7F7F", "o", "-.", hollow=True, size=8.5))
+ORACLE_TEACHER = _method("oracle-teacher", Style("#7F7F7F", "d", "-.", hollow=True, size=8.5))
 CEILING = _method("ceiling", Style("#000000", "h", "-", hollow=True, size=8.5))
