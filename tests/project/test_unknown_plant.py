@@ -31,7 +31,7 @@ PUCK = """<mujoco>
   <motor joint="y" ctrlrange="-4 4"/>
 </actuator>
 </mujoco>"""
-LIMIT_N, STEPS, SUBSTEPS = 4.0, 60, 4
+LIMIT_N, STEPS, SUBSTEPS = 4.0, 80, 4
 CONFIG = """
 [encoder]
 embedding = 64
@@ -74,7 +74,7 @@ def record(episodes, seed, exploration_n):
             frames[n, k] = renderer.render()
             if k % 5 == 0:
                 push_n = random.normal(0, exploration_n, 2)
-            law_n = -16 * data.qpos - 1.6 * data.qvel
+            law_n = -16 * data.qpos - 3.2 * data.qvel
             expert[n, k] = law_n.clip(-LIMIT_N, LIMIT_N)
             actions[n, k] = (expert[n, k] + push_n).clip(-LIMIT_N, LIMIT_N)
             data.ctrl[:] = actions[n, k]
@@ -86,7 +86,7 @@ def record(episodes, seed, exploration_n):
 @pytest.mark.slow
 def test_a_recorded_plant_is_learned_and_beats_holding_three_times(tmp_path, monkeypatch, capsys):
     shell = open_shell(tmp_path, monkeypatch, capsys)
-    np.savez(tmp_path / "train.npz", **record(40, 0, 1.5))
+    np.savez(tmp_path / "train.npz", **record(32, 0, 1.5))
     np.savez(tmp_path / "test.npz", **record(8, 1, 0.0))
     (tmp_path / "small.toml").write_text(CONFIG)
 
