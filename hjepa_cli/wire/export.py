@@ -214,10 +214,10 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
         MissingInputError: onnx, onnxscript or onnxruntime are not installed.
         StorageError: the disk refused.
     """
-    for module in ("onnx", "onnxscript", "onnxruntime"):
-        require(module, f"export needs {module}", "export")
     model = load_fp32(path)
     check_pictures(model, path)
+    for module in ("onnx", "onnxscript", "onnxruntime"):
+        require(module, f"export needs {module}", "export")
     method = exported_method(model, method)
     kind, entries = plant(model.plant_name), dict[str, Any]()
     files.make_directory(directory)

@@ -49,6 +49,10 @@ def test_the_page_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
         assert "state" not in columns
         assert columns["pixels"].shape == (len(columns["action"]), 32, 64, 3)
 
+    refused = shell("export", "runs/robot", "--to", "bundle", "--quiet")
+    assert_one_line_error(refused, 2, "learned from recordings")
+    assert not (tmp_path / "bundle").exists()
+
     path = tmp_path / "runs" / "eval" / "0001" / "result.json"
     result = json.loads(path.read_text())
     del result["methods"]["hold"]["steps_within"]
