@@ -106,7 +106,7 @@ def refuse_closed_loop(**flags: bool) -> None:
         if given:
             raise UsageError(
                 f"--{name} is about closed loops; a recorded plant has none",
-                hint="hjepa eval --dataset DIR without it",
+                hint="hjepa eval --dataset DIR, without it",
             )
 
 

@@ -118,7 +118,7 @@ def refuse_recorded(settings: Settings, why: str) -> None:
     if settings.plant == RECORDED:
         raise UsageError(
             f"{why}; a recorded plant has no equations",
-            hint="hjepa eval --dataset DIR compares methods that need none",
+            hint="hjepa eval --dataset DIR, which needs none",
         )
 
 
@@ -138,12 +138,12 @@ def check_same_plant(metadata: Mapping[str, Any], settings: Settings, what: str)
         raise DataError(
             f"{what} was trained on pictures of {shown(size)}, "
             f"the dataset has {shown(settings.camera)}",
-            hint="hjepa train-encoder with this dataset",
+            hint="hjepa train-encoder, with this dataset",
         )
     if theirs == RECORDED and plant_in(theirs, metadata["settings"]) != plant_of(settings):
         raise DataError(
             f"{what} was trained on recordings of another plant than the dataset has",
-            hint="hjepa train-encoder with this dataset",
+            hint="hjepa train-encoder, with this dataset",
         )
 
 

@@ -197,7 +197,7 @@ def counting(
     if settings.plant == RECORDED:
         raise UsageError(
             "a recorded plant has no closed loop to measure a tolerance in",
-            hint="hjepa scale --tolerance-steps STEPS; hjepa eval says how forces err with time",
+            hint="hjepa scale --tolerance-steps STEPS; eval says how forces err with time",
         )
     if radio.fading != "block":
         check_speed(radio.speed_m_s, radio.carrier_ghz, plant_of(settings).step_s)

@@ -32,6 +32,7 @@ from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen, span, ticking
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import results
+from hjepa_cli.stages.inputs import refuse_recorded
 from hjepa_cli.stages.measuring import cached, seconds_of_loops
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -126,6 +127,7 @@ def opened(
     further: Sequence[Path] | None,
 ) -> tuple[ModelSet, list[str]]:
     """Open the models; return them and the methods that are measured. Raises as :func:`run`."""
+    refuse_recorded(settings, "survival is measured in closed loops")
     check_methods(settings.methods)
     parse_snr(settings.radio.snr_db)
     check_cell(settings.radio, nr=settings.nr)

@@ -147,7 +147,7 @@ def _still(dataset: Dataset, split: str, what: str) -> DataError:
     """Return the error of data without variance, of which nothing can be learned."""
     other = "hjepa collect with other starts or exploration in [collect] of --config FILE.toml"
     if dataset.plant == RECORDED:
-        other = "hjepa data import with recordings in which something moves"
+        other = "hjepa data import SOURCE with recordings in which something moves"
     return DataError(
         f"dataset {dataset.path}: all {what} of split '{split}' are equal: nothing moves in it",
         hint=other,

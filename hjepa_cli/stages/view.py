@@ -44,6 +44,7 @@ from hjepa_cli.errors import MissingInputError, UsageError, choices, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import CODECS, METHODS
+from hjepa_cli.stages.inputs import refuse_recorded
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, seconds_of
 from hjepa_cli.storage import files
@@ -226,6 +227,7 @@ def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) ->
 
     Raise MissingInputError without a model of the plant, UsageError for any other method.
     """
+    refuse_recorded(settings, "views show simulated devices")
     models = open_model_set(settings, screen, checkpoint, None)
     if models.model is None:
         train = f"hjepa reproduce --preset {settings.preset}"

@@ -34,7 +34,8 @@ from hjepa_cli.core.networks.hierarchy import hold, plan_stride
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import camera_in, plant
+from hjepa_cli.core.plants.recorded import Recorded
 from hjepa_cli.errors import DataError, NumericalError, UsageError, choices, require, shell
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage import files
@@ -189,17 +190,34 @@ def networks_of(model: Model, method: str) -> dict[str, tuple[nn.Module, Inputs,
     }
 
 
+def check_pictures(model: Model, path: Path) -> None:
+    """Raise UsageError for a model of recordings, or of pictures that are not 64 × 128 × 3.
+
+    Exported networks are calibrated and compared on simulated pictures, and cameras of devices
+    take those of one size.
+    """
+    if isinstance(model.plant, Recorded):
+        raise UsageError(
+            f"{path} learned from recordings; export compares networks on simulated pictures",
+            hint="in Python, hjepa_cli.load_model(PATH) has encode(frames) and actor(z)",
+        )
+    if (shape := camera_in(model.architecture).frame_shape) != FRAME_SHAPE:
+        sizes = [" × ".join(map(str, size)) for size in (shape, FRAME_SHAPE)]
+        raise UsageError(f"{path} sees pictures of {sizes[0]}; devices take those of {sizes[1]}")
+
+
 def export(path: Path, directory: Path, method: str | None) -> Bundle:
     """Write a checkpoint's bundle into a directory, the manifest last.
 
     Raises:
-        UsageError: the model has no such planner.
+        UsageError: the model has no such planner, or its pictures are none that devices take.
         MissingInputError: onnx, onnxscript or onnxruntime are not installed.
         StorageError: the disk refused.
     """
+    model = load_fp32(path)
+    check_pictures(model, path)
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, f"export needs {module}", "export")
-    model = load_fp32(path)
     method = exported_method(model, method)
     kind, entries = plant(model.plant_name), dict[str, Any]()
     files.make_directory(directory)

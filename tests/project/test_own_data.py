@@ -1,9 +1,13 @@
 """The page about recordings is run: its recording, its commands, its Python."""
 
+import json
 import re
 
+import numpy as np
 import pytest
-from command_line import ROOT, open_shell
+from command_line import ROOT, assert_one_line_error, open_shell
+
+from hjepa_cli.storage import seals
 
 PAGE = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
 TRAINED = ("train-encoder", "train-hierarchy", "eval")  # small here, to see that they run
@@ -38,3 +42,28 @@ def test_the_page_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
     exec(compile(python, "own_data.md", "exec"), {})
     assert "recorded-0001 (" in capsys.readouterr().out
     assert shell("report", "runs/robot-encoder", "runs/eval/0001", "--quiet").code == 0
+
+    exported = shell("data", "export", "--out", "robot.npz", "--pixels", "--quiet")
+    assert exported.code == 0, exported
+    with np.load(tmp_path / "robot.npz") as columns:  # of a plant without states
+        assert "state" not in columns
+        assert columns["pixels"].shape == (len(columns["action"]), 32, 64, 3)
+
+    refused = shell("export", "runs/robot", "--to", "bundle", "--quiet")
+    assert_one_line_error(refused, 2, "learned from recordings")
+    assert not (tmp_path / "bundle").exists()
+
+    path = tmp_path / "runs" / "eval" / "0001" / "result.json"
+    result = json.loads(path.read_text())
+    del result["methods"]["hold"]["steps_within"]
+    path.write_text(json.dumps(seals.sealed(result)))
+    assert_one_line_error(shell("report", "runs/eval/0001"), 65, "steps_within")
+
+
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]], ids=["run", "plan"])
+@pytest.mark.parametrize("command", ["train-reflex", "train-fusion", "tune-law", "survive", "view"])
+def test_what_needs_equations_is_refused(tmp_path, monkeypatch, capsys, command, dry):
+    shell = open_shell(tmp_path, monkeypatch, capsys)
+    with shell.untouched():
+        outcome = shell(command, "--plant", "recorded", *dry)
+    assert_one_line_error(outcome, 2, "a recorded plant has no equations")

@@ -117,7 +117,7 @@ def _unknown_law(states: ArrayLike) -> Floats:
 def _refuse(verb: str) -> NoReturn:
     raise UsageError(
         f"a recorded plant cannot {verb}: there are recordings of it, and no simulator",
-        hint="hjepa eval --dataset DIR measures what needs none",
+        hint="hjepa eval --dataset DIR, which needs none",
     )
 
 
