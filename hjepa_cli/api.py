@@ -94,7 +94,7 @@ def drive(
 
     Args:
         method: as on the command line; those on embeddings need ``model``. Packets of ``hold+9``
-            come 9 steps late, and the controller takes them for fresh.
+            come 9 steps later than the settings' ``protocol.delay_steps`` say.
         model: of :func:`load_model`, of the same plant.
         gap_steps: a packet every so many steps; or
         delivery: a packet at every step that arrives with this probability. Neither: all arrive.
@@ -106,7 +106,8 @@ def drive(
         ``score`` [n] (share inside the band) and ``cost`` [n] (mean capped quadratic cost).
 
     Raises:
-        UsageError: unknown method, both kinds of link, or no device.
+        UsageError: unknown method, both kinds of link, no device, or packets that come later than
+            the controller remembers.
         DataError: ``model`` is of another plant.
     """
     check_count("devices", devices)
@@ -122,7 +123,7 @@ def drive(
     seen: list[tuple[Floats, Floats]] = []
     outcome = simulate(
         actual_plant(chosen.plant, chosen.conditions),
-        draws,
+        how.draws(draws),
         (schedule if how.uses_link else np.ones_like(schedule))[None],
         how.controller(devices),
         how.sensor,

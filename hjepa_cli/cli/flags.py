@@ -26,6 +26,7 @@ from hjepa_cli.config.schema import (
     must_be,
 )
 from hjepa_cli.config.settings import PRESETS, PROTOCOLS
+from hjepa_cli.errors import MissingInputError
 from hjepa_cli.plugins import LAWS, METHODS, PHYS, PLANTS, SCHEDULERS
 
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
@@ -76,6 +77,12 @@ def written_path(text: str | Path) -> Path:
     """Parse a path to write to; an empty one, of an unset variable, would be this directory."""
     if not str(text).strip():
         raise typer.BadParameter("an empty path; leave the flag out, or name a place")
+    return Path(text)
+
+
+def _read_path(text: str | Path) -> Path:
+    if not str(text).strip() or not Path(text).exists():
+        raise MissingInputError(f"'{text}' does not exist")
     return Path(text)
 
 
@@ -295,8 +302,8 @@ _SETTINGS = {
     "plugin": Input(
         list[Path],
         "--plugin",
-        "Python file that adds plants, codecs, schedulers, methods, laws or physical layers; may "
-        "be repeated.",
+        "Python file that adds plants, codecs, schedulers, methods, laws, physical layers or "
+        "stages; may be repeated.",
         "FILE.py",
         default=[],
     ),
@@ -327,6 +334,16 @@ def taken(name: str) -> Input:
     offered = None if flag.metavar or name not in NAMES else lambda: list(NAMES[name])
     panel = LOOP if name == "methods" else PANELS[name.rpartition(".")[0]]
     return Input(hint, **vars(flag), complete=offered, panel=panel)
+
+
+def stage_input(word: str, default: Any) -> Input:
+    """Return the flag of an input of a plugin's stage: a switch, or a path that is there."""
+    flag, text = f"--{word.replace('_', '-')}", word.replace("_", " ").capitalize()
+    if default is False:
+        one = _switch(flag, f"{text}.")
+    else:
+        one = Input(Path, flag, f"{text} to read.", "PATH", default=default, parse=_read_path)
+    return dataclasses.replace(one, panel=FILES)
 
 
 def annotation(one: Input) -> Any:

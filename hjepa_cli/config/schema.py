@@ -26,6 +26,8 @@ Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Candidates = Annotated[int, Meta(ge=4, le=10_000)]  # of a round of CMA-ES
+Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,11 +198,28 @@ class ReflexSettings:
     gradient_clip: NotNegative = 1.0
     search_devices: Count = 32  # on the true state, of gains and decay together
     search_steps: Count = 1000
-    search_candidates: Count = 48
+    search_candidates: Candidates = 48
     search_rounds: Count = 10
     fit_devices: Count = 24  # on embeddings, of a factor and the decay
-    fit_candidates: Count = 12
+    fit_candidates: Candidates = 12
     fit_rounds: Count = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class FusionSettings:
+    """``train-fusion`` learns what to make of packets that are not quite right.
+
+    They are those of devices in the settings' [conditions], quantised as [protocol] says.
+    """
+
+    rounds: Count = 12  # of loops, then training on them
+    devices: Count = 32  # in the conditions, and as many in none
+    loop_steps: Count = 700
+    steps: Count = 300  # of training in a round
+    batch: Count = 256
+    learning_rate: NotNegative = 1e-3
+    weight_decay: NotNegative = 1e-2
+    gradient_clip: NotNegative = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,6 +251,16 @@ class ProtocolSettings:
             "FRACTION",
         ),
     ] = 0.0
+    delay_steps: Annotated[
+        Delay, Flag("--delay-steps", "Steps from a packet's capture to the force that answers it.")
+    ] = 0
+    jitter_steps: Annotated[
+        Delay, Flag("--jitter-steps", "Up to so many steps more, anew for every packet.")
+    ] = 0
+    downlink_loss: Annotated[
+        BelowOne,
+        Flag("--downlink-loss", "Share of datagrams with forces that are lost.", "FRACTION"),
+    ] = 0.0
     payload: Annotated[
         str,
         Flag(
@@ -259,13 +288,47 @@ class ProtocolSettings:
         return self.warmup_steps + self.steps
 
     @property
+    def ideal_link(self) -> bool:
+        """Return whether packets come at once and every force arrives, as in the paper."""
+        return not any(getattr(self, key) for key in IDEAL_LINK)
+
+    @property
     def velocity_noise(self) -> tuple[float, ...]:
         """Return the standard deviation of what disturbs a step, one per state."""
         return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
 
 
+IDEAL_LINK = ("delay_steps", "jitter_steps", "downlink_loss")  # all 0 in the paper
+
 # What --protocol paper sets over these: scored from the start on.
 PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlSettings:
+    """``collect`` and all after it: the law that models learn and that their rivals play.
+
+    Without gains it is the plant's own teacher. The law is u = −K x; K is given row by row, one
+    row per force. ``hjepa tune-law`` finds both.
+    """
+
+    gains_n: tuple[Number, ...] = ()  # N per unit of state
+    ceiling_gains_n: tuple[Number, ...] = ()  # of method ceiling, which no actor has to learn
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneSettings:
+    """``tune-law`` searches both laws on the true state.
+
+    Errors are standard deviations in units of those that states have under the teacher.
+    """
+
+    devices: Count = 24
+    steps: Count = 2000  # scored, after the protocol's warm-up
+    candidates: Candidates = 12
+    rounds: Count = 24
+    packet_error: NotNegative = 0.05  # of the state that a packet tells
+    actor_error: NotNegative = 0.2  # of the state that the law sees, anew at every step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -530,6 +593,9 @@ class Settings:
         *("hjepa", "ts-jepa-1", "ts-jepa-4", "chunk", "hold-decay-linear"),
         *("hold", "optimal", "oracle"),
     )
+    control: ControlSettings = ControlSettings()
+    tune: TuneSettings = TuneSettings()
+    fusion: FusionSettings = FusionSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
     actor: ActorSettings = ActorSettings()
@@ -544,10 +610,16 @@ class Settings:
     def as_dict(self) -> dict[str, Any]:
         """Return nested plain data, ready for JSON (tuples become lists).
 
-        Empty lists are left out: they stand for values that say the same, and digests of settings
-        stay what they were before there were such lists.
+        Empty lists and the zeros of an ideal link are left out: they stand for values that say the
+        same, and digests of settings stay what they were before there were such settings.
         """
-        return typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+        values = _without_empty(plain(dataclasses.asdict(self)))
+        for key in IDEAL_LINK:
+            if not values["protocol"][key]:
+                del values["protocol"][key]
+        if not values["control"]:
+            del values["control"]
+        return values
 
 
 @functools.cache
@@ -615,9 +687,18 @@ def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
     return flat
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items() if entry != ()}
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
-    return value
+def plain(value: Any) -> Any:
+    """Return nested values with lists for tuples, and Python's numbers for those of numpy."""
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return [plain(entry) for entry in value] if isinstance(value, tuple | list) else value
+
+
+def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_empty(entry) if isinstance(entry, dict) else entry
+        for key, entry in values.items()
+        if entry != []
+    }

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hjepa_cli.core.control.force_error import WINDOWS
+from hjepa_cli.core.control.link import described
 from hjepa_cli.core.evaluation.protocol import BESIDE
 from hjepa_cli.output.screen import Screen, described_steps, tolerance
 
@@ -51,6 +52,17 @@ def show_reflex(result: dict[str, Any], screen: Screen) -> None:
     )
 
 
+def show_fusion(result: dict[str, Any], screen: Screen) -> None:
+    """Print how far predictions, packets and what is made of both are from the truth."""
+    distances = result["distances"]
+    screen.table(
+        f"distance 1 − cos from clean embeddings, over {result['packets']} packets of loops that "
+        "training did not see",
+        [*distances],
+        [[f"{value:.5f}" for value in distances.values()]],
+    )
+
+
 def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
     """Print the tables of an evaluation: what each method does, and its score over the gap."""
     entries = result["methods"]
@@ -58,7 +70,7 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
         return
     first = next(iter(entries.values()))
     windows = [f"{start}-{end}" for start, end in WINDOWS]
-    where = f"{result['plant']}, seed {result['seed']}"
+    where = f"{result['plant']}, seed {result['seed']}{described(result.get('link', {}))}"
     errors, tolerances, scores = [], [], []
     for name, entry in entries.items():
         nmae = (_number(entry["nmae_windows"].get(window), 3) for window in windows)

@@ -34,8 +34,9 @@ from hjepa_cli.core.plants.frames import FRAME_BITS, HEIGHT_PX, WIDTH_PX, frames
 from hjepa_cli.core.plants.named import plant, plant_of
 from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.plugins import PLANTS
 from hjepa_cli.stages.plan import Plan, seconds_of
-from hjepa_cli.storage.files import check_free_space, point_to
+from hjepa_cli.storage.files import check_free_space, point_to, refuse_foreign
 from hjepa_cli.storage.runs import continue_command, differences
 from hjepa_cli.storage.shards import (
     LOG,
@@ -74,6 +75,8 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     }
     if conditions := altered(settings.as_dict()):  # clean rollouts are of such devices
         definition["conditions"] = conditions
+    if control := settings.as_dict().get("control"):
+        definition["control"] = control
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
             return describe_finished(directory, screen, settings.plant, definition)
@@ -108,7 +111,17 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
 
 
 def plan(settings: Settings, *, out: Path | None = None) -> Plan:
-    """Plan the simulation of all splits and, if frames are stored, their pictures."""
+    """Plan the simulation of all splits and, if frames are stored, their pictures.
+
+    It refuses what :func:`run` would refuse, but for a full or read-only disk.
+    """
+    check(settings)
+    plant_of(settings)
+    if out is not None and (out / MANIFEST).exists():
+        load_dataset(out, settings.plant)
+    elif out is not None:
+        refuse_foreign(out, "dataset", lambda name: name == LOG or bool(NAME.fullmatch(name)))
+        check_same(out, settings)
     options, sizes = settings.collect, split_sizes(settings.collect).values()
     steps = sum(count * steps for count, steps in sizes)
     frames = steps + sum(count for count, _ in sizes) if options.frames == "stored" else 0
@@ -179,6 +192,11 @@ def recorded_settings(directory: Path) -> Settings:
     Raises DataError if the log is damaged, or of a version with other settings.
     """
     task = read_task(directory)
+    if isinstance(name := task.get("plant"), str) and name not in PLANTS:
+        raise UsageError(
+            f"{directory} collects of plant '{name}', which no plugin in force adds",
+            hint=f"{continue_command(directory)} --plugin FILE.py",
+        )
     preset = task.pop("preset", None)
     if preset is not None and not isinstance(preset, str):
         raise DataError(f"{directory} is of preset {preset!r}")

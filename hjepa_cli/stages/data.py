@@ -15,6 +15,7 @@ from hjepa_cli.core.datasets.dataset import (
     find_newest_dataset,
     load_dataset,
 )
+from hjepa_cli.core.plants.control_law import control_law, control_of
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError, require
@@ -128,7 +129,8 @@ def export(
     target = files.target(out or Path(f"{data.path.name}-{split}{FORMATS[kind][0]}"))
     system = plant(data.plant)
     limit_n, camera = system.force_limit_n, system.camera()
-    values = exports.columns(recorded, system.teacher()(recorded.states[:, 0]), limit_n)
+    act = control_law(system, control_of(data.settings, data.path))
+    values = exports.columns(recorded, act(recorded.states[:, 0]), limit_n)
     about = {
         "dataset": data.digest,
         "plant": data.plant,

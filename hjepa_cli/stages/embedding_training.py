@@ -18,6 +18,7 @@ from hjepa_cli.core.control.force_error import window_means
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks.model import Model, tensors_of
+from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, fit_actor
@@ -60,7 +61,8 @@ def embed_all(
     what the teacher does there. With ``flip`` all of these are there in the mirror too.
     """
     device, kind, count = resolve_device(settings.device), plant(settings.plant), len(train.frames)
-    mirror, teach = torch.tensor(kind.mirror), labels_of(train, kind)
+    act, mirror = control_law(kind, settings.control), torch.tensor(kind.mirror)
+    teach = labels_of(train, kind, act)
     every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
     views = []
     for mirrored, shifts_px in views_of(settings, count, flip=flip):
@@ -98,15 +100,21 @@ def fit_network(
     optimiser: Optimiser,
     stream: Generator,
     draw: Callable[[], Drawn],
+    *,
+    phase: str | None = None,
 ) -> None:
-    """Train the one called ``name`` of a run's networks, as :meth:`TrainingRun.fit`."""
+    """Train the one called ``name`` of a run's networks, as :meth:`TrainingRun.fit`.
+
+    The ``phase`` has a name of its own where one network is trained in several.
+    """
+    phase = phase or name
 
     def report(step: int, loss: float) -> None:
         if step % REPORT_EVERY == 0 or step == optimiser.steps:
-            run.record.metric({"level": name, "step": step, "loss": loss})
+            run.record.metric({"level": phase, "step": step, "loss": loss})
 
     modules[name].train()
-    run.fit(name, optimiser, {"modules": modules}, stream, draw, report)
+    run.fit(phase, optimiser, {"modules": modules}, stream, draw, report)
     modules[name].eval()
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from hjepa_cli.config.checks import needs_model, split_late
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control import link
 from hjepa_cli.core.control.loop import LOOP_VERSION
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation import curves
@@ -17,6 +18,7 @@ from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.evaluation.entries import MethodEntries
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.workers import open_workers
+from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen, ticking
 from hjepa_cli.stages.model_set import ModelSet, how_to_train
@@ -114,6 +116,7 @@ def curves_for(
         "plant": settings.plant,
         "seed": settings.seed,
         "loop_version": LOOP_VERSION,
+        "link": link.facts(settings.protocol, len(plant(settings.plant).force_signs)),
         "acceptable_score": settings.protocol.acceptable_score,
         "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
         "horizon": list(range(settings.protocol.horizon + 1)),

@@ -18,6 +18,7 @@ from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.workers import ModelFile
 from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.named import plant, plant_of
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
@@ -27,7 +28,7 @@ from hjepa_cli.storage import runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 from hjepa_cli.storage.zoo import CURVES_FILE
 
-TRAINING = ("train-encoder", "train-hierarchy", "train-reflex")
+TRAINING = ("train-encoder", "train-hierarchy", "train-reflex", "train-fusion")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,6 +169,8 @@ def open_model_set(
             f"model {path} drives plant {model.plant_name}, not {settings.plant}",
             hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
         )
+    if model:
+        settings = under_law_of(model, settings)
     data = open_dataset(dataset, settings) if dataset else None
     first = ModelSet(settings, model, path, data)
     if further is None:
@@ -177,7 +180,9 @@ def open_model_set(
     others = []
     for one in further:
         other = Model.load(one, settings.device)
-        others.append(ModelSet(settings, other, one, data))
+        others.append(ModelSet(under_law_of(other, settings), other, one, data))
+        if others[-1].settings.control != settings.control:
+            screen.say(f"{one} learned another law than {path or 'the settings'}")
         encoder = other.metadata.get("encoder")  # models on raw frames need none
         if model and encoder not in (None, model.digest, model.metadata.get("encoder")):
             screen.say(
@@ -185,6 +190,12 @@ def open_model_set(
                 f"methods; {how_to_train(methods_of(other)[0], settings)} trains it on this one"
             )
     return dataclasses.replace(first, further=tuple(others))
+
+
+def under_law_of(model: Model, settings: Settings) -> Settings:
+    """Return settings with the law that a model learned, for all that is compared with it."""
+    control = control_of(model.metadata["settings"], model.digest)
+    return dataclasses.replace(settings, control=control)
 
 
 def how_to_train(method: str, settings: Settings) -> str:

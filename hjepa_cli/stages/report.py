@@ -24,7 +24,10 @@ Result = dict[str, Any]
 Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
-STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale", "survive")
+STAGES = (
+    *("train-encoder", "train-hierarchy", "train-reflex", "train-fusion", "eval", "scale"),
+    "survive",
+)
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 SMOKE = "smoke"
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
@@ -275,7 +278,7 @@ def survival_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
 
 
 FIGURES: dict[str, Callable[..., Figures]] = {
-    **dict.fromkeys(("train-encoder", "train-hierarchy", "train-reflex"), training_figures),
+    **{stage: training_figures for stage in STAGES if stage.startswith("train-")},
     "eval": eval_figures,
     "scale": scale_figures,
     "survive": survival_figures,

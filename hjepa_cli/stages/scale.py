@@ -13,6 +13,7 @@ from typing import Any
 
 from hjepa_cli.config.checks import check_cell
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.capacity import parse_snr
@@ -82,6 +83,7 @@ def run(
                 "plant": settings.plant,
                 "seed": settings.seed,
                 "acceptable_score": settings.protocol.acceptable_score,
+                "link": link.facts(settings.protocol, len(kind.force_signs)),
                 "law": radio.law,
                 "phy": radio.phy,
                 **({} if radio.phy == "shannon" else {"nr": settings.as_dict()["nr"]}),

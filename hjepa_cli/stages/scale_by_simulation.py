@@ -12,6 +12,7 @@ from typing import Any
 
 from hjepa_cli.config.checks import check_schedulable, check_warmup
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.device_ratios import best_flat, ratio_of
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES
 from hjepa_cli.core.evaluation.workers import open_workers
@@ -129,6 +130,7 @@ class BySimulation:
         screen, grid_db = self._screen, list(dict.fromkeys(row["snr_db"] for row in result["rows"]))
         lines = [row for row in result["rows"] if row["snr_db"] == grid_db[0]]
         sample = f"{result['seeds']} seeds" if result["seeds"] > 1 else f"seed {result['seed']}"
+        sample += link.described(result.get("link", {}))
         screen.table(
             f"one resource block of {result['plant']} loops at score "
             f"{result['acceptable_score']:g}, {grid_db[0]:g} dB: {sample}, 95 % CI; "

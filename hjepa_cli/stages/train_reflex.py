@@ -23,6 +23,7 @@ from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.networks.reflex import Reflex
+from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.training import decay_fit, reflex_training
@@ -276,7 +277,8 @@ def teacher_plans(
             hold_steps=options.exploration_hold_steps,
             generator=explore,
         )
-    return reflex_training.follow(kind, starts, steps, sides=sides, pushes_n=pushes_n)
+    act = control_law(kind, settings.control)
+    return reflex_training.follow(kind, act, starts, steps, sides=sides, pushes_n=pushes_n)
 
 
 def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[str, Any]]:
@@ -290,7 +292,8 @@ def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[st
     searched = {"candidates": options.search_candidates, "rounds": options.search_rounds}
     screen.say("searching laws whose force fades, on the true state")
     kind, devices = plant(settings.plant), options.search_devices
-    trial = Trial.make(kind, protocol, devices=devices, steps=options.search_steps, seed=seed)
+    act = control_law(kind, settings.control)
+    trial = Trial.make(kind, act, protocol, devices=devices, steps=options.search_steps, seed=seed)
     law, _ = decay_fit.search_law(trial, seed=seed, **searched)
     faded, gain = decay_fit.search_law(trial, seed=seed, tied=True, **searched)
     said = {

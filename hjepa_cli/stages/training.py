@@ -22,6 +22,7 @@ from hjepa_cli.compute.versions import versions
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.datasets.dataset import Dataset, Trajectories
 from hjepa_cli.core.networks.model import build_modules
+from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.progress import Part, Progress
@@ -152,6 +153,9 @@ def run_training(
     """
     keep_freed_memory()
     dataset, recorded = data
+    # A dataset brings the law that its labels are of.
+    control = control_of(dataset.settings, dataset.path)
+    settings = dataclasses.replace(settings, control=control)
     inputs = {"dataset": describe_input(dataset.path, dataset.digest)}
     inputs |= {name: describe_input(one.path, one.digest) for name, one in sources.items()}
     with ExitStack() as stack:

@@ -13,9 +13,21 @@ import torch
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.drivers import build_driver, methods_of
-from hjepa_cli.core.control.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
+from hjepa_cli.core.control.link import described
+from hjepa_cli.core.control.link import facts as link_facts
+from hjepa_cli.core.control.loop import (
+    Bools,
+    Controller,
+    Draws,
+    Floats,
+    LinkDraws,
+    gap_schedule,
+    simulate,
+    takes_ages,
+)
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
@@ -41,26 +53,36 @@ class Believer:
     """A linear probe reads, at every step, what a controller of n devices believes."""
 
     def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
-        self._controller, self._probe = controller, probe
+        self._controller: Any = controller
+        self._probe = probe
         self._last: torch.Tensor | None = None
+        self._heard = False
         self.believed: list[Floats] = []
 
-    def act(self, delivered: Bools, packets: Any) -> Floats:
+    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]."""
-        forces_n = self._controller.act(delivered, packets)
-        if isinstance(self._controller, StrideController):
+        told = (ages,) if takes_ages(self._controller) else ()
+        forces_n: Floats = self._controller.act(delivered, packets, *told)
+        self._heard |= packets is not None
+        if not self._heard:  # the link is late: a device is believed to be at rest
+            states = np.zeros((len(delivered), self._probe.shape[1]))
+        elif isinstance(self._controller, StrideController):
             start, end, share = self._controller.belief
             states = self._read(start)
             states += share[:, None] * (self._read(end) - states)
         else:  # no prediction: what it received last
             if packets is not None:
                 if self._last is None:
-                    self._last = packets.clone()
+                    self._last = packets.new_zeros(len(delivered), packets.shape[1])
                 self._last[torch.from_numpy(delivered)] = packets
-            assert self._last is not None, "the first packets always arrive"
+            assert self._last is not None
             states = self._read(self._last)
         self.believed.append(states)
         return forces_n
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the controller tells besides, as the forces that it has planned."""
+        return getattr(self._controller, name)
 
     def _read(self, z: torch.Tensor) -> Floats:
         return np.asarray(health.read_probe(self._probe, z.cpu()).numpy())
@@ -109,7 +131,7 @@ def run(
         raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
     models = open_viewable(settings, screen, checkpoint)
     link = make_link(settings, models.model, devices, snr_db, delivery, gap_steps)
-    screen.say(link.label)
+    screen.say(link.label + link.late)
     probe = fit_probe(settings, models.model, screen)
     films = [film(name, settings, models.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.total_steps // 100, 1)
@@ -122,7 +144,7 @@ def run(
             one.method: {"share_in_band": one.score.mean(axis=0), **belief_errors(one, kind)}
             for one in films
         },
-        "delivered": link.delivered.mean(),
+        "delivered": link.sent.mean(),
         "pictures": len(pictures),
         "file": None if live else out,
     }
@@ -199,21 +221,25 @@ def make_link(
     the law ``equal`` for as many devices as bring p about.
     """
     steps, kind = settings.protocol.total_steps, plant(settings.plant)
+    draws = LinkDraws.make(settings.protocol, devices, settings.seed)
+    facts = link_facts(settings.protocol, len(kind.force_signs))
+    late = described(facts)
     if gap_steps is not None:
         schedule = gap_schedule(gap_steps, steps, devices)
         label = f"a packet every {gap_steps:g} steps, SNR {snr_db:g} dB by power control"
-        return Link(schedule, np.full((steps, devices), snr_db), False, label)
+        return Link(schedule, np.full((steps, devices), snr_db), False, label, draws, late)
     streams = [generator(settings.seed, FADING_KEY, device) for device in range(devices)]
     gains = np.stack([rayleigh_power_gains(stream, steps) for stream in streams], axis=1)
     delivered = gains >= -np.log(delivery)
     delivered[0] = True
     bits = CODECS[settings.protocol.payload].bits(model.architecture["embedding"])
+    bits += int(facts["confirmation_bits"])
     sharing = equal_devices(delivery, bits, settings.radio.bandwidth_hz, kind.step_s, snr_db)
     label = (
         f"Rayleigh fading, mean SNR {snr_db:g} dB, packets arrive with p = {delivery:g}: "
         f"{sharing} devices share {settings.radio.bandwidth_hz / 1e6:g} MHz"
     )
-    return Link(delivered, snr_db + 10 * np.log10(gains), True, label)
+    return Link(delivered, snr_db + 10 * np.log10(gains), True, label, draws, late)
 
 
 def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
@@ -238,14 +264,14 @@ def film(
     """Drive the devices with one method and keep every state and belief."""
     kind = actual_plant(settings.plant, settings.conditions)
     method = build_driver(name, settings, model)
-    steps, devices = link.delivered.shape
+    steps, devices = link.sent.shape
     believer = Believer(method.controller(devices), probe)
     states: list[Floats] = []
     with screen.progress(f"simulate {name}", steps, "steps") as bar:
         simulate(
             kind,
             Draws.make(settings.protocol, devices, settings.seed),
-            link.delivered[None],
+            link.sent[None],
             believer,
             method.sensor,
             tick=bar.advance,

@@ -265,7 +265,7 @@ def read_result(directory: Path) -> dict[str, Any]:
         DataError: damaged, or changed after it was written.
     """
     path, environment = directory / RESULT, read_environment(directory)
-    again = f"run it again: hjepa {environment['stage']} --config {directory / CONFIG}"
+    again = f"run it again: {anew(environment, directory / CONFIG)}"
     result = seals.read(path, RESULT_SCHEMA, again)
     if seals.SEAL not in result:
         if environment["schema"] == SCHEMA:
@@ -304,8 +304,7 @@ def read_config(directory: Path) -> dict[str, Any]:
         if recorded["schema"] == SCHEMA and (changed := differences(recorded["settings"], found)):
             raise DataError(
                 f"{path} was changed after the run was begun: {'; '.join(changed)}",
-                hint=f"put it back, or for a run with it: hjepa {recorded['stage']} "
-                f"--config {path} --out DIR",
+                hint=f"put it back, or for a run with it: {anew(recorded, path)} --out DIR",
             )
     return found
 
@@ -344,21 +343,38 @@ def check_plugins(directory: Path, recorded: Mapping[str, Any]) -> None:
     begun_with = [Source(one["name"], one["sha256"]) for one in recorded["plugins"]]
     for plugin in begun_with:
         if plugin.sha256 not in now:
-            why = "has changed since" if plugin.name in now.values() else "is not in force"
-            install = f"pip install {plugin.name.replace(' ', '==')}"
+            why, hint = "is not in force", continue_command(directory, begun_with)
+            if plugin.installed:
+                hint = f"pip install {plugin.name.replace(' ', '==')}"
+            elif plugin.name in now.values():
+                why, again = "has changed since", anew(recorded, directory / CONFIG)
+                hint = f"restore the file, or begin anew: {again} --out DIR"
             raise UsageError(
-                f"{directory} was begun with plugin {plugin.name}, which {why}",
-                hint=install if plugin.installed else continue_command(directory, begun_with),
+                f"{directory} was begun with plugin {plugin.name}, which {why}", hint=hint
             )
 
 
 def continue_command(directory: Path, plugins: Iterable[Source] | None = None) -> str:
     """Return what takes a run up again, with its plugins, or those that are in force now."""
-    words = ["resume", str(directory)]
-    for source in in_force() if plugins is None else plugins:
-        if not source.installed:
-            words += ["--plugin", source.name]
+    words = ["resume", str(directory), *_named(in_force() if plugins is None else plugins)]
     return f"{torchrun.program()} {shlex.join(words)}"
+
+
+def anew(recorded: Mapping[str, Any], config: Path | None = None) -> str:
+    """Return the command of a recorded run: its settings in a file, its plugins and inputs."""
+    words = [recorded["stage"], *(["--config", str(config)] if config else [])]
+    words += _named(Source(one["name"], one["sha256"]) for one in recorded["plugins"])
+    for name, value in recorded["inputs"].items():
+        flag = f"--{name.replace('_', '-')}"
+        if value is True:
+            words.append(flag)
+        elif isinstance(value, Mapping) and " " not in name:  # of several models the first
+            words += [flag, str(value.get("path"))]
+    return f"hjepa {shlex.join(words)}"
+
+
+def _named(plugins: Iterable[Source]) -> list[str]:
+    return [word for one in plugins if not one.installed for word in ("--plugin", one.name)]
 
 
 def version_of(recorded: Mapping[str, Any]) -> str | None:

@@ -325,8 +325,6 @@ def test_grants_and_reports_of_an_nr_cell(stage):
 def test_moving_devices(stage, fading):
     if fading != "jakes":
         pytest.importorskip("sionna")
-    result = stage(
-        "hold-true", schedulers=["max-aoi"], fading=fading, speed_m_s=10.0, snr_db="20"
-    )
+    result = stage("hold-true", schedulers=["max-aoi"], fading=fading, speed_m_s=10.0, snr_db="20")
     assert result["rows"][0]["devices"] > 0
     assert f"{fading} at 10 m/s" in stage.out.getvalue()

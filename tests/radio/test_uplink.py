@@ -144,9 +144,7 @@ def test_reports_in_levels_that_take_a_while():
 def test_a_copy_waits_for_its_round_trip():
     """After a lost first copy the device is not served before three slots have gone by."""
     growth = ErrorGrowthTable(np.full(50, 1.0))
-    access = Access(
-        "max-aoi", 2, 300.0, -math.inf, 1.0, (1.0, 0.0), growth, 0, round_trip_slots=3
-    )
+    access = Access("max-aoi", 2, 300.0, -math.inf, 1.0, (1.0, 0.0), growth, 0, round_trip_slots=3)
     uplink, arrivals = Uplink(access, 2), []
     for _ in range(9):
         uplink.begin()

@@ -2,6 +2,10 @@
 
 Nothing here can reach a plant: a controller is built from functions of what it received (a
 planner, an actor, the equations of motion), never from the simulator that it drives.
+
+Where packets come late, ``act`` is told their ages. A controller that predicts then moves a packet
+on to the present under the forces that it sent meanwhile, and not under those that it would have
+sent had the packet been there.
 """
 
 from collections.abc import Callable
@@ -11,8 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, Integers
+from hjepa_cli.core.control.link import AHEAD_STEPS, REMEMBERED_STEPS, SentForces
 from hjepa_cli.core.networks.planning import Planner, Reaction
+from hjepa_cli.errors import UsageError
 
 
 class _Strides:
@@ -24,21 +30,35 @@ class _Strides:
         self._forces_n = torch.zeros(devices, stride, *action_shape)
         self._phase = np.full(devices, stride)
         self._heard = np.zeros(devices, dtype=bool)
+        self._sent = SentForces(devices, REMEMBERED_STEPS, action_shape)
 
     @torch.inference_mode()
-    def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
+    def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
 
         A device that has not been heard yet gets 0 N.
         """
         if packets is not None:
+            packets = self._take(delivered, packets, ages)
             if not self._z.shape[1]:
                 self._z = packets.new_zeros(len(delivered), packets.shape[1])
             self._z[torch.from_numpy(delivered)] = packets
             self._heard |= delivered
         played = self._play(delivered | self._over)
         self._phase[self._heard] += 1
+        if ages is not None:
+            self._sent.note(played)
         return played
+
+    def ahead_n(self) -> Floats:
+        """Return the forces [n, stride, *A] of the last step and of what its stride has left.
+
+        Behind its end the last one is repeated.
+        """
+        steps = np.maximum(self._phase - 1, 0)[:, None] + np.arange(self._stride)
+        steps = np.minimum(steps, self._stride - 1)
+        forces_n = self._forces_n.numpy()[np.arange(len(steps))[:, None], steps]
+        return np.asarray(forces_n, dtype=np.float64)
 
     @torch.inference_mode()
     def planned_n(self) -> Floats:
@@ -47,6 +67,10 @@ class _Strides:
         ``act`` then plans only for those who do get a packet.
         """
         return self._play(self._over)
+
+    def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
+        """Return the embeddings to plan from [delivered.sum(), D]."""
+        raise NotImplementedError
 
     def _plan(self, due: Bools) -> Tensor:
         """Return forces_n [due.sum(), stride, *A] from the embeddings of those who are due."""
@@ -74,6 +98,19 @@ class StrideController(_Strides):
         super().__init__(planner.stride, devices, action_shape)
         self._planner, self._starts = planner, self._z
 
+    def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
+        """Move late packets on to the present."""
+        if ages is None or not ages.any():
+            return packets
+        if not hasattr(self._planner, "follow"):  # of a plugin
+            raise UsageError(
+                f"packets come late, and {type(self._planner).__name__} cannot move an embedding "
+                "on under given forces: it has no follow(z, forces_n, ages)",
+                hint="write one (docs/plugins.md), or leave out --delay-steps and --jitter-steps",
+            )
+        forces_n = self._sent.since(np.flatnonzero(delivered), ages)
+        return self._planner.follow(packets, torch.from_numpy(forces_n).float(), ages)
+
     def _plan(self, due: Bools) -> Tensor:
         if not self._starts.shape[1]:
             self._starts = torch.zeros_like(self._z)
@@ -98,6 +135,57 @@ class StrideController(_Strides):
         return self._starts, self._z, (self._phase - 1) / self._stride
 
 
+class FusingController(StrideController):
+    """Plays a planner from what packets make of its own predictions: a filter in latent space.
+
+    Args:
+        planner: what it predicts and plays with.
+        devices: n.
+        correct: maps predicted embeddings and those of packets [m, D] to what is taken for true.
+        action_shape: A, of the plant.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        devices: int,
+        *,
+        correct: Callable[[Tensor, Tensor], Tensor],
+        action_shape: tuple[int, ...] = (),
+    ) -> None:
+        super().__init__(planner, devices, action_shape=action_shape)
+        self._correct, self._anchors = correct, self._z
+        self._anchor_ages = np.zeros(devices, dtype=np.int64)
+
+    def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
+        """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D]."""
+        if ages is None:  # the forces that were sent are remembered for packets on time, too
+            ages = np.zeros(int(delivered.sum()), dtype=np.int64)
+        played = super().act(delivered, packets, ages)
+        self._anchor_ages += 1
+        return played
+
+    def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
+        """Correct what was predicted for the moment of each packet, then move on to the present."""
+        assert ages is not None
+        if not self._anchors.shape[1]:
+            self._anchors = packets.new_zeros(len(delivered), packets.shape[1])
+        rows, predicted = np.flatnonzero(delivered), packets.clone()
+        known = self._heard[rows] & (self._anchor_ages[rows] <= REMEMBERED_STEPS)
+        if known.any():
+            old, at = rows[known], torch.from_numpy(rows[known])
+            if ages.any():
+                since = self._anchor_ages[old]
+                forces_n = torch.from_numpy(self._sent.since(old, since)).float()
+                moved = self._planner.follow(self._anchors[at], forces_n, since - ages[known])
+            else:  # the stride that is being played leads there
+                moved = self._planner.follow(self._starts[at], self._forces_n[at], self._phase[old])
+            predicted[torch.from_numpy(known)] = moved
+        corrected = self._correct(predicted, packets)
+        self._anchors[torch.from_numpy(rows)], self._anchor_ages[rows] = corrected, ages
+        return super()._take(delivered, corrected, ages)
+
+
 class ReflexController(_Strides):
     """Plays a reaction for n devices, to the last packet, its age and the forces since."""
 
@@ -109,17 +197,27 @@ class ReflexController(_Strides):
         self._sent_n = torch.zeros(devices, reaction.remembers, *action_shape)
         self._ages = np.zeros(devices, dtype=np.int64)
 
-    def act(self, delivered: Bools, packets: Tensor | None) -> Floats:
+    def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D]."""
-        if packets is not None:
-            self._sent_n[torch.from_numpy(delivered)] = 0.0
-            self._ages[delivered] = 0
-        played = super().act(delivered, packets)
+        played = super().act(delivered, packets, ages)
         remembered = np.flatnonzero(self._heard & (self._ages < self._sent_n.shape[1]))
         at = torch.from_numpy(remembered), torch.from_numpy(self._ages[remembered])
         self._sent_n[at] = torch.from_numpy(played[remembered]).to(self._sent_n.dtype)
         self._ages += 1
         return played
+
+    def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
+        """Start anew at the age of each packet, with the forces that were sent since."""
+        self._sent_n[torch.from_numpy(delivered)] = 0.0
+        self._ages[delivered] = 0
+        if ages is not None:
+            self._ages[delivered] = ages
+            since_n = self._sent.since(np.flatnonzero(delivered), ages)
+            kept = min(since_n.shape[1], self._sent_n.shape[1])
+            fresh_n = torch.zeros(len(since_n), *self._sent_n.shape[1:])
+            fresh_n[:, :kept] = torch.from_numpy(since_n[:, :kept]).to(fresh_n.dtype)
+            self._sent_n[torch.from_numpy(delivered)] = fresh_n
+        return packets
 
     def _plan(self, due: Bools) -> Tensor:
         rows, ages = torch.from_numpy(due), torch.from_numpy(self._ages[due])
@@ -130,7 +228,8 @@ class LastForce:
     """Acts on each packet, then keeps that force, lets it fade, or applies none.
 
     At age j it plays clip(s · C(packet) · e^(−j/τ)). With the teacher as actor and a packet at
-    every step this is the optimal controller.
+    every step this is the optimal controller. A late packet is taken for fresh: who predicts
+    nothing knows nothing better.
 
     Args:
         actor: packets [m, ...] → forces_n [m, *A].
@@ -159,7 +258,7 @@ class LastForce:
             np.broadcast_to(value, devices).reshape(column)
             for value in (gain, keep * np.exp(-1.0 / np.asarray(tau_steps)))
         )
-        self._forces_n = np.zeros((devices, *action_shape))
+        self._played_n = self._forces_n = np.zeros((devices, *action_shape))
 
     @torch.inference_mode()
     def act(self, delivered: Bools, packets: Any) -> Floats:
@@ -168,6 +267,7 @@ class LastForce:
             forces_n = self._actor(packets)
             fresh_n = forces_n.float().cpu().numpy() if isinstance(forces_n, Tensor) else forces_n
             self._forces_n[delivered] = fresh_n * self._gain[delivered]
+        self._played_n = self._forces_n
         played = self.planned_n()
         self._forces_n = self._forces_n * self._kept + 0.0  # which makes 0 of −0
         return played
@@ -175,6 +275,13 @@ class LastForce:
     def planned_n(self) -> Floats:
         """Return the forces [n, *A] of the coming step if no packet comes."""
         return np.clip(self._forces_n, -self._limit_n, self._limit_n)
+
+    def ahead_n(self) -> Floats:
+        """Return the forces [n, L, *A] of the last step and of the next ones without a packet."""
+        kept = self._kept[:, None] ** np.arange(AHEAD_STEPS).reshape(
+            -1, *[1] * (self._kept.ndim - 1)
+        )
+        return np.clip(self._played_n[:, None] * kept, -self._limit_n, self._limit_n)
 
 
 class Oracle:
@@ -189,6 +296,7 @@ class Oracle:
         force_limit_n: the actuator clips here, and the oracle knows.
         devices: n.
         states: S.
+        action_shape: A, of the plant.
     """
 
     def __init__(
@@ -199,19 +307,36 @@ class Oracle:
         devices: int,
         *,
         states: int = 4,
+        action_shape: tuple[int, ...] = (),
     ) -> None:
         self._actor, self._advance, self._limit_n = actor, advance, force_limit_n
         self._states = np.zeros((devices, states))
+        self._sent = SentForces(devices, REMEMBERED_STEPS, action_shape)
 
-    def act(self, delivered: Bools, packets: Floats | None) -> Floats:
+    def act(self, delivered: Bools, packets: Floats | None, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are true states [delivered.sum(), S]."""
         if packets is not None:
+            if ages is not None:
+                packets = self._follow(packets, np.flatnonzero(delivered), ages)
             self._states[delivered] = packets
-        forces_n = np.clip(self._actor(self._states), -self._limit_n, self._limit_n)
-        # ±50 is where the loop clips true states too: a lost pole must not overflow.
-        self._states = np.clip(self._advance(self._states, forces_n), -50.0, 50.0)
+        forces_n = self.planned_n()
+        self._states = self._moved(self._states, forces_n)
+        if ages is not None:
+            self._sent.note(forces_n)
         return forces_n
 
     def planned_n(self) -> Floats:
         """Return the forces [n, *A] of the coming step if no packet comes."""
         return np.clip(self._actor(self._states), -self._limit_n, self._limit_n)
+
+    def _follow(self, states: Floats, devices: Integers, ages: Integers) -> Floats:
+        """Move late packets on to the present under the forces that were sent meanwhile."""
+        forces_n, states = self._sent.since(devices, ages), states.copy()
+        for step in range(forces_n.shape[1]):
+            on = ages > step
+            states[on] = self._moved(states[on], forces_n[on, step])
+        return states
+
+    def _moved(self, states: Floats, forces_n: Floats) -> Floats:
+        # ±50 is where the loop clips true states too: a lost pole must not overflow.
+        return np.clip(self._advance(states, forces_n), -50.0, 50.0)

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable, conformal_growth
 from hjepa_cli.core.control.force_error import control_error
@@ -48,14 +48,16 @@ class TwoLevels:
         self._apart = np.zeros(0)
 
     @torch.inference_mode()
-    def act(self, delivered: Bools, packets: Any) -> Floats:
+    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the controller's forces [n, *A], and let the second level follow them."""
-        forces_n = self._controller.act(delivered, packets)
+        forces_n = self._controller.act(delivered, packets, ages)
         if packets is not None:
             if not len(self._beside):
                 self._beside = packets.new_zeros(len(delivered), packets.shape[1])
                 self._apart = np.zeros(len(delivered))
-            self._beside[torch.from_numpy(delivered)] = packets
+            rows = torch.from_numpy(delivered)
+            starts, _, _ = self._controller.belief
+            self._beside[rows] = starts[rows]  # the packets, at the present
             self._apart[delivered] = 0.0
         self._beside = self._step(self._beside, torch.from_numpy(forces_n).float())
         over, reached = self._controller.reached
@@ -69,6 +71,10 @@ class TwoLevels:
     def planned_n(self) -> Floats:
         """Return the controller's forces [n, *A] of the coming step if no packet comes."""
         return self._controller.planned_n()
+
+    def ahead_n(self) -> Floats:
+        """Return what the controller plans [n, L, *A]."""
+        return self._controller.ahead_n()
 
     @property
     def apart(self) -> Floats:

@@ -6,6 +6,7 @@ carries the estimate from one packet to the next. No network predicts anything.
 """
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,9 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.config.schema import Settings
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.embedded_split import embed_split
+from hjepa_cli.core.control.link import REMEMBERED_STEPS
 from hjepa_cli.core.control.loop import STATE_LIMIT, noise_per_step
 from hjepa_cli.core.networks.health import fit_probe, read_probe
 from hjepa_cli.core.plants.system import Teacher
@@ -80,23 +82,48 @@ class KalmanController:
         self._limit_n = force_limit_n
         self._mean = np.zeros((devices, len(filter_.c)))
         self._spread = np.tile(filter_.start, (devices, 1, 1))
+        # What it believed in its last steps, and did: a late packet corrects the past.
+        self._past: deque[tuple[Floats, Floats, Floats]] = deque(maxlen=REMEMBERED_STEPS)
 
-    def act(self, delivered: Bools, packets: Any) -> Floats:
+    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are those of ``read``."""
         if packets is not None:
-            self._mean[delivered], self._spread[delivered] = self._filter.correct(
-                self._mean[delivered], self._spread[delivered], self._read(packets)
-            )
+            seen = self._read(packets)
+            if ages is None or not ages.any():
+                self._correct(self._mean, self._spread, delivered, seen)
+            else:
+                self._correct_past(np.flatnonzero(delivered), seen, ages)
         forces_n = self.planned_n()
         actions = forces_n.reshape(len(forces_n), -1) / self._limit_n
-        mean, spread = self._filter.predict(self._mean, self._spread, actions)
-        self._mean = np.clip(mean, -STATE_LIMIT, STATE_LIMIT)
+        if ages is not None:
+            self._past.append((self._mean, self._spread, actions))
+        self._mean, self._spread = self._predict(self._mean, self._spread, actions)
+        return forces_n
+
+    def _correct(self, mean: Floats, spread: Floats, devices: Any, seen: Floats) -> None:
+        """Take in what was seen of some devices, in place."""
+        mean[devices], spread[devices] = self._filter.correct(mean[devices], spread[devices], seen)
+
+    def _correct_past(self, devices: Integers, seen: Floats, ages: Integers) -> None:
+        """Take in what was seen so many steps ago, and live through the time since once more."""
+        ages = np.minimum(ages, len(self._past))  # of the first steps there is no past
+        for back in range(int(ages.max()), -1, -1):
+            then = (self._mean, self._spread) if back == 0 else self._past[-back][:2]
+            if (now := ages == back).any():
+                self._correct(*then, devices[now], seen[now])
+            if back and len(since := devices[ages >= back]):
+                after = (self._mean, self._spread) if back == 1 else self._past[1 - back][:2]
+                moved = self._predict(then[0][since], then[1][since], self._past[-back][2][since])
+                after[0][since], after[1][since] = moved
+
+    def _predict(self, mean: Floats, spread: Floats, actions: Floats) -> tuple[Floats, Floats]:
+        mean, spread = self._filter.predict(mean, spread, actions)
         # Seconds without a packet: beyond the loop's own limits a covariance means nothing more,
         # and in the end no number holds it.
         deviation = np.sqrt(np.einsum("nii->ni", spread))
         within = np.minimum(1.0, STATE_LIMIT / deviation)
-        self._spread = within[:, :, None] * spread * within[:, None, :]
-        return forces_n
+        spread = within[:, :, None] * spread * within[:, None, :]
+        return np.clip(mean, -STATE_LIMIT, STATE_LIMIT), spread
 
     def planned_n(self) -> Floats:
         """Return the forces [n, *A] of the coming step if no packet comes."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.control.embedded_split import EmbeddedSplit, embed_split
 from hjepa_cli.core.networks.encoder import normalise
 from hjepa_cli.core.networks.symmetry import reflect
@@ -60,6 +61,14 @@ class LinearPlanner:
         return forces_n.unsqueeze(1), self._latent.step(
             z, forces_n.reshape(len(z), -1) / self._limit_n
         )
+
+    def follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:
+        """Move embeddings on, as :class:`~hjepa_cli.core.networks.planning.Planner` says."""
+        z, actions = z.clone(), forces_n.flatten(2) if forces_n.dim() > 2 else forces_n[..., None]
+        for step in range(forces_n.shape[1]):
+            on = torch.from_numpy(ages > step)
+            z[on] = self._latent.step(z[on], actions[on, step].to(z.device) / self._limit_n)
+        return z
 
 
 def fit_linear_latent(model: "Model", settings: Settings) -> LinearLatent:

@@ -3,15 +3,17 @@
 One step k of every loop, in this order:
 
 1. a device that transmits at k senses its state (its last frames, or the true state) and the
-   controller receives the packet, without delay unless it takes longer than a slot;
+   controller receives the packet, or one that was sensed earlier where the link is late;
 2. the controller picks the force u_k, from packets alone;
-3. step k is scored on the state x_k and the force u_k, once the warm-up is over;
-4. the plant moves to x_{k+1} under u_k and process noise.
+3. the device plays it, or, where that is lost on its way, what an earlier datagram said of k;
+4. step k is scored on the state x_k and the force that is played, once the warm-up is over;
+5. the plant moves to x_{k+1} under that force and process noise.
 
 Devices N and curve points P (different link schedules on the same draws) share one simulation.
 """
 
 import dataclasses
+import inspect
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -19,10 +21,12 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import NDArray
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, Integers
+from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
 from hjepa_cli.core.plants.system import System
@@ -30,7 +34,7 @@ from hjepa_cli.errors import NumericalError, UsageError
 
 LOOP_VERSION = 5  # raise it whenever a measured number changes: cached curves then expire
 STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
-_DRAWS_KEY = 0xD4A5
+_DRAWS_KEY, _LINK_KEY = 0xD4A5, 0x11A7
 GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples, modulo 1, spread evenly however many are taken
 
 
@@ -41,7 +45,12 @@ class Controller(Protocol):
         """Return the forces of one step in newton [n, *A].
 
         Of the devices ``delivered`` [n] packets arrive, which carry ``packets``
-        [delivered.sum(), ...]; ``None`` when there are none.
+        [delivered.sum(), ...]; ``None`` when there are none. A controller that has a third argument
+        ``ages``, integers [delivered.sum()] or by default ``None``, is told at every step of a link
+        that may be late how many steps ago each packet was sensed. Another takes them for fresh.
+
+        One that has ``ahead_n()``, too, tells devices the forces [n, L, *A] of this step and of the
+        next ones without a packet; of others a device holds the last force that reaches it.
         """
         ...
 
@@ -67,6 +76,7 @@ class Draws:
         delivery: uniform numbers; a packet gets through where they are below p [steps, N].
         mass_scale: two masses of each device (a cart's and its pole's) ÷ nominal [N, 2].
         warmup_steps: how many of the steps, the first ones, are not scored.
+        link: of what else happens to what is sent.
     """
 
     initial: Floats
@@ -74,6 +84,7 @@ class Draws:
     delivery: Floats
     mass_scale: Floats
     warmup_steps: int = 0
+    link: "LinkDraws" = dataclasses.field(default_factory=lambda: LinkDraws())
 
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
@@ -88,7 +99,13 @@ class Draws:
             initial[device], mass_scale[device], delivery[:, device] = start, scale, uniforms
             noise[:, device] = random.standard_normal((protocol.total_steps, states))
         noise *= noise_per_step(protocol)
-        return cls(initial, noise, delivery, mass_scale, protocol.warmup_steps)
+        link = LinkDraws.make(protocol, devices, seed)
+        return cls(initial, noise, delivery, mass_scale, protocol.warmup_steps, link)
+
+    @property
+    def on_device(self) -> "Draws":
+        """Return the same for controllers that sit on the device, where no link is in between."""
+        return dataclasses.replace(self, link=LinkDraws())
 
     @property
     def devices(self) -> int:
@@ -100,8 +117,108 @@ class Draws:
 
     def part(self, devices: slice) -> "Draws":
         """Take the draws of some of the devices."""
-        by_step = self.noise[:, devices], self.delivery[:, devices]
-        return Draws(self.initial[devices], *by_step, self.mass_scale[devices], self.warmup_steps)
+        return Draws(
+            self.initial[devices],
+            self.noise[:, devices],
+            self.delivery[:, devices],
+            self.mass_scale[devices],
+            self.warmup_steps,
+            self.link.part(devices),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class LinkDraws:
+    """Tells how late each packet is and which forces are lost; nothing where that never happens.
+
+    Attributes:
+        delay_steps: what every packet takes to arrive.
+        extra_steps: what it takes besides [steps, N].
+        lost: whether the datagram with a step's force is lost [steps, N].
+    """
+
+    delay_steps: int = 0
+    extra_steps: NDArray[np.int16] | None = None
+    lost: Bools | None = None
+
+    @classmethod
+    def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "LinkDraws":
+        """Draw for ``devices`` devices; a device's draws do not depend on how many there are."""
+        extra, lost = [], []
+        for device in range(devices):
+            random, steps = generator(seed, _LINK_KEY, device), protocol.total_steps
+            if protocol.jitter_steps:
+                extra.append(random.integers(protocol.jitter_steps + 1, size=steps, dtype=np.int16))
+            if protocol.downlink_loss:
+                lost.append(generator(seed, _LINK_KEY, device, 1).random(steps))
+        return cls(
+            protocol.delay_steps,
+            np.stack(extra, axis=1) if extra else None,
+            np.stack(lost, axis=1) < protocol.downlink_loss if lost else None,
+        )
+
+    def part(self, devices: slice | Integers) -> "LinkDraws":
+        """Take the draws of some of the devices."""
+        extra, lost = (None if of is None else of[:, devices] for of in self._drawn)
+        return LinkDraws(self.delay_steps, extra, lost)
+
+    def tiled(self, points: int) -> "LinkDraws":
+        """Repeat the draws of the devices for so many curve points."""
+        extra, lost = (None if of is None else np.tile(of, (1, points)) for of in self._drawn)
+        return LinkDraws(self.delay_steps, extra, lost)
+
+    @property
+    def jitter_steps(self) -> int:
+        """Return the most that any packet takes besides."""
+        return 0 if self.extra_steps is None else int(self.extra_steps.max(initial=0))
+
+    @property
+    def _drawn(self) -> tuple[Any, Any]:
+        return self.extra_steps, self.lost
+
+
+def takes_ages(controller: Controller) -> bool:
+    """Return whether a controller wants to be told how old packets are."""
+    return "ages" in inspect.signature(controller.act).parameters
+
+
+class Link:
+    """Carries the packets of n devices to a controller, and its forces to them.
+
+    Args:
+        draws: of these devices.
+        controller: drives them.
+        delay_steps: what packets take besides, because they are long.
+
+    Raises:
+        UsageError: a packet may be later than the controller remembers what it sent.
+    """
+
+    def __init__(self, draws: LinkDraws, controller: Controller, delay_steps: int = 0) -> None:
+        delay_steps += draws.delay_steps
+        self._late = delay_steps > 0 or draws.extra_steps is not None
+        self._in_flight = InFlight(delay_steps, draws.extra_steps)
+        self._downlink = None if draws.lost is None else Downlink(draws.lost)
+        self._controller = controller
+        self._told = self._late and takes_ages(controller)
+        if self._told and (latest := delay_steps + draws.jitter_steps) > REMEMBERED_STEPS:
+            raise UsageError(
+                f"packets may come {latest} steps late; a controller remembers what it sent in the "
+                f"last {REMEMBERED_STEPS}",
+                hint=f"make delay and jitter {REMEMBERED_STEPS} steps or less together",
+            )
+
+    def forces_n(self, sent: Bools, packets: Any) -> Floats:
+        """Send the packets of one step; return the forces [n, *A] that devices play in it."""
+        ages = None
+        if self._late:
+            sent, packets, ages = self._in_flight.pass_on(sent, packets)
+        act: Any = self._controller.act
+        forces_n: Floats = act(sent, packets, ages) if self._told else act(sent, packets)
+        if self._downlink is None:
+            return forces_n
+        ahead_n = getattr(self._controller, "ahead_n", lambda: forces_n[:, None])
+        return self._downlink.play(ahead_n())
 
 
 def device_draws(
@@ -225,7 +342,7 @@ def simulate(
         delivered: link schedules [P, steps, N]; see :func:`gap_schedule`.
         controller: drives P · N devices, point by point; in its initial state.
         sensor: turns states into packets.
-        delay_steps: how long a packet is under way.
+        delay_steps: how long a packet is under way besides what the draws say of it.
         tick: called after every step, for progress.
         watch: called at every step with k, states [P · N, S] and applied forces [P · N, *A].
 
@@ -239,12 +356,11 @@ def simulate(
     )
     noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
     plants = ScoredPlants(plant, initial, mass_scale, noise, draws.warmup_steps)
-    nothing = np.zeros(points * devices, dtype=bool), None
-    under_way = deque([nothing] * min(delay_steps, steps))
+    link = Link(draws.link.tiled(points), controller, delay_steps)
     for k in range(steps):
         states, sent = plants.states, delivered[:, k].reshape(-1)
-        under_way.append((sent, plants.sense(sensor, sent)))
-        watch(k, states, plants.move(controller.act(*under_way.popleft())))
+        forces_n = link.forces_n(sent, plants.sense(sensor, sent))
+        watch(k, states, plants.move(forces_n))
         tick()
     means = plants.means(steps - draws.warmup_steps)
     return Outcome(*(values.reshape(points, devices) for values in means))

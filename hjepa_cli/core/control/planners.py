@@ -1,14 +1,56 @@
 """Planners give controllers a model's predictions: one stride of forces at a time, in newton."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
 from torch import Tensor, nn
 
+from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.networks.hierarchy import hold, plan_stride
 from hjepa_cli.core.networks.reflex import Reflex
 
 if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
+
+
+def follow(
+    model: "Model",
+    strides: Sequence[tuple[int, nn.Module]],
+    z: Tensor,
+    forces_n: Tensor,
+    ages: Integers,
+) -> Tensor:
+    """Move embeddings [n, D] on by their ages, with the coarsest predictor as far as it goes.
+
+    Args:
+        model: whose predictors they are.
+        strides: control steps and predictor of each level, coarse ones first; the last is of 1.
+        z: embeddings [n, D]; they stay as they are.
+        forces_n: what was applied since, [n, L, *A].
+        ages: how many steps ago each was true [n].
+    """
+    z, actions = z.clone(), forces_n.to(z.device) / model.force_limit_n
+    done = np.zeros_like(ages)
+    with model.autocast():
+        for stride, predictor in strides:
+            while (due := ages - done >= stride).any():
+                rows = np.flatnonzero(due)
+                at = torch.from_numpy(done[rows, None] + np.arange(stride))
+                of = torch.from_numpy(rows)
+                z[of] = predictor(z[of], actions[of[:, None], at]).to(z.dtype)
+                done[rows] += stride
+    return z
+
+
+def corrected(posterior: nn.Module, predicted: Tensor, packets: Tensor) -> Tensor:
+    """Return where devices are [n, D], from where they were predicted to be and their packets.
+
+    The posterior is a predictor that is guided by the packet, over no time and under no force.
+    """
+    z: Tensor = posterior(predicted, predicted.new_zeros(len(predicted), 0), packets)
+    return z
 
 
 class Hierarchy:
@@ -33,6 +75,18 @@ class Hierarchy:
             )
         return self._model.force_limit_n * actions, z_next
 
+    def correct(self, predicted: Tensor, packets: Tensor) -> Tensor:
+        """Return where devices are [n, D], by the model's posterior: see :func:`corrected`."""
+        with self._model.autocast():
+            z = corrected(self._model.networks["posterior"], predicted, packets)
+        return z.to(packets.dtype)
+
+    def follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:
+        """Move embeddings on, by P^H in strides and by the predictor of stride 1 for the rest."""
+        networks = self._model.networks
+        strides = ((self.stride, networks["high"]), (1, networks["flat"]))
+        return follow(self._model, strides, z, forces_n, ages)
+
 
 class OnePredictor:
     """Plans as TS-JEPA: one predictor of a fixed depth, the action held in between."""
@@ -45,6 +99,11 @@ class OnePredictor:
         with self._model.autocast():
             actions = hold(self._model.act(z), self.stride)
             return self._model.force_limit_n * actions, self._predictor(z, actions)
+
+    def follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:
+        """Move embeddings on in strides; a rest that is none goes by the predictor of stride 1."""
+        strides = ((self.stride, self._predictor), (1, self._model.networks["flat"]))
+        return follow(self._model, strides, z, forces_n, ages)
 
     def step(self, z: Tensor, forces_n: Tensor) -> Tensor:
         """Go a stride on under given forces: z [N, D], forces_n [N, *A] → embeddings [N, D]."""

@@ -1,4 +1,4 @@
-"""Trajectories train networks: the teacher drives, exploration shows what a force does."""
+"""Trajectories train networks: a law drives, exploration shows what a force does."""
 
 import numpy as np
 
@@ -7,6 +7,7 @@ from hjepa_cli.config.schema import CollectSettings, Settings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.datasets.dataset import Trajectories
 from hjepa_cli.core.plants.conditions import actual_plant
+from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 
 STREAM = 1  # this stage's branch of the seed tree
@@ -26,9 +27,11 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     """Simulate a split, or ``rows`` of it, all trajectories at once; frames are not rendered.
 
     One step without force leads from the drawn state to k = 0, because the camera needs a frame
-    before it. The applied force is the teacher's plus exploration, clipped; the label is the
-    teacher's alone. ``clean`` has no exploration, and devices as ``conditions`` have them.
-    Trajectory i does not depend on how many there are.
+    before it. The applied force is the law's plus exploration, clipped; the label is the law's
+    alone. A tuned law leaves little to see, since it is quick to bring a device to rest: where
+    there is one, the plant's own teacher drives every second trajectory. ``clean`` has no
+    exploration, and devices as ``conditions`` have them. Trajectory i does not depend on how many
+    there are.
     """
     kind, clean = plant(settings.plant), split == "clean"
     size, steps = split_sizes(settings.collect)[split]
@@ -41,7 +44,10 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
 
     # Methods are measured on clean rollouts.
     moved = actual_plant(settings.plant, settings.conditions) if clean else kind
-    force_n, simulation = kind.teacher(), moved.simulation(count)
+    law_n, own_n = control_law(kind, settings.control), kind.teacher()
+    simulation, by_teacher = moved.simulation(count), np.zeros(count, bool)
+    if law_n is not own_n and not clean:
+        by_teacher = np.arange(indices.start, indices.stop) % 2 == 1
     simulation.states = initial
     states = np.empty((count, steps + 1, len(kind.state_names)))
     applied_n, teacher_n = np.empty((2, count, steps, *kind.action_shape))
@@ -49,8 +55,11 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     simulation.step(kind.no_force(count))
     for k in range(steps):
         states[:, k + 1] = simulation.states
-        teacher_n[:, k] = force_n(states[:, k + 1])
-        applied_n[:, k] = teacher_n[:, k] + exploration_n[:, k]
+        teacher_n[:, k] = driven_n = law_n(states[:, k + 1])
+        if by_teacher.any():
+            driven_n = driven_n.copy()
+            driven_n[by_teacher] = own_n(states[by_teacher, k + 1])
+        applied_n[:, k] = driven_n + exploration_n[:, k]
         applied_n[:, k] = applied_n[:, k].clip(-kind.force_limit_n, kind.force_limit_n)
         simulation.step(applied_n[:, k])
     return Trajectories(*(array.astype(np.float32) for array in (states, applied_n, teacher_n)))

@@ -19,6 +19,8 @@ from hjepa_cli.core.control.drivers import Driver
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable, conformal_growth
 from hjepa_cli.core.control.force_error import control_error
 from hjepa_cli.core.control.loop import (
+    Link,
+    LinkDraws,
     ScoredPlants,
     device_draws,
     noise_per_step,
@@ -76,6 +78,7 @@ def simulate_cell(
     warmup_steps, uplink = protocol.warmup_steps, Uplink(access, devices)
     plants = ScoredPlants(plant, *streamed_draws(protocol, devices, seed), warmup_steps)
     controller: Any = method.controller(devices)
+    link = Link(LinkDraws.make(protocol, devices, seed), controller)
     outbox, packets, early_reports = Outbox(), np.zeros(devices, dtype=np.int64), 0
     first_counted = max(warmup_steps, 1)
     for k in range(protocol.total_steps):
@@ -90,7 +93,7 @@ def simulate_cell(
         arrived = uplink.grant()
         packets += arrived if k >= first_counted else 0
         fresh = plants.sense(method.sensor, uplink.sampled)
-        plants.move(controller.act(arrived, outbox.deliver(fresh, uplink.sampled, arrived)))
+        plants.move(link.forces_n(arrived, outbox.deliver(fresh, uplink.sampled, arrived)))
         tick(devices)
     score, cost, _ = plants.means(protocol.steps)
     reports, counted_slots = uplink.reports - early_reports, protocol.total_steps - first_counted

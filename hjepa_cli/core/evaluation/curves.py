@@ -89,6 +89,8 @@ class Digest:
         }
         if system := definition(values["plant"]):
             measured["system"] = system
+        if control := values.get("control"):
+            measured["control"] = control
         if conditions:  # or digests would not be those of before there were conditions
             measured["conditions"] = conditions
         fitted = [values["collect"][key] for key in FITTED]

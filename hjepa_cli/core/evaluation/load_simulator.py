@@ -169,7 +169,7 @@ class LoadSimulator(Simulator):
             teacher = self.driver("optimal")
             outcome = simulate(
                 self.plant,
-                Draws.make(protocol, count, seed),
+                teacher.draws(Draws.make(protocol, count, seed)),
                 every_step(protocol.total_steps, count)[None],
                 teacher.controller(count),
                 teacher.sensor,

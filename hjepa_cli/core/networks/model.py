@@ -19,6 +19,7 @@ from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
+from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import same_camera
@@ -54,7 +55,7 @@ def build_modules(
     ``action_shape`` and ``force_signs`` are the plant's. By ``kind``:
 
     - ``encoder``: Ψ and its companion P^H;
-    - ``hierarchy``: Ψ, all levels, the flat baseline and the actor;
+    - ``hierarchy``: Ψ, all levels, the flat baseline and the actor, with ``fusion`` a posterior;
     - ``flat``: Ψ, a predictor of stride h, the one of stride 1 and the actor;
     - ``supervised``: Ψ, of κ frames, and the actor;
     - ``autoencoder``: Ψ, the decoder, a second Ψ that reads what was decoded, and the actor;
@@ -103,6 +104,10 @@ def build_modules(
             mirror=mirror,
         )
         modules.update({name: predictors[name] for name in levels_of(architecture)})
+    if architecture.get("fusion"):
+        modules["posterior"] = Predictor(
+            embedding, architecture["hidden"], 0, guided=True, mirror=mirror
+        )
     if kind == "autoencoder":
         modules["decoder"] = Decoder(embedding, frames, symmetric)
         modules["reader"] = encoder()

@@ -4,6 +4,8 @@ from typing import Protocol
 
 from torch import Tensor
 
+from hjepa_cli.core.arrays import Integers
+
 
 class Planner(Protocol):
     """It turns embeddings into a stride of forces and the embeddings that the next starts from."""
@@ -14,6 +16,12 @@ class Planner(Protocol):
 
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Map embeddings [n, D] to forces_n [n, stride, *A] and the next embeddings [n, D]."""
+
+    def follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:
+        """Move embeddings [n, D] on by their ages in steps [n], under forces_n [n, L, *A].
+
+        Of a row's forces only so many are read as its age has steps.
+        """
 
 
 class Reaction(Protocol):

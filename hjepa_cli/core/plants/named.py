@@ -49,6 +49,7 @@ def plant_of(settings: Settings) -> System:
                 f"{name} has {len(values)} values; plant {kind.name} has {len(kind.state_names)} "
                 f"states: {', '.join(kind.state_names)}",
                 hint=f"--plant {kind.name}, or a --config FILE.toml that sets {name}",
+                key=name,
             )
     return kind
 

@@ -166,7 +166,7 @@ class Uplink:
         )
         trips = self._lost * self._access.round_trip_slots
         repeats = (self._lost > 0) & self._able  # a copy that waits is worth less every slot
-        scores = np.where(repeats, np.inf, self._score(view))
+        scores = np.where(repeats, np.inf, self._checked(self._score(view)))
         scores = np.where(self._behind < trips, 0.0, scores)  # the base station has yet to answer
         chosen = pick(scores, self._access.blocks)
         sent = chosen & self._able if self._slot else np.ones_like(chosen)
@@ -194,6 +194,19 @@ class Uplink:
             return np.asarray(self._delta * 2.0 ** (np.clip(level, 0, levels - 1) + 0.5))
         steps = 2**INNOVATION_BITS
         return np.asarray((np.minimum(np.floor(innovation * steps), steps - 1) + 0.5) / steps)
+
+    def _checked(self, scores: object) -> Floats:
+        """Return scores; raise UsageError where they are none. It costs little beside a slot."""
+        found = np.asarray(scores)
+        if found.shape != self._gain.shape or found.dtype.kind not in "fiub":
+            shown = f"{np.shape(found)} of {found.dtype}"
+        elif math.isnan(found.max()):
+            shown = f"NaN for device {int(np.isnan(found).argmax())}"
+        else:
+            return found
+        name = self._access.scheduler
+        wanted = f"expected numbers of shape {self._gain.shape}"
+        raise SCHEDULERS.fault(name, f"scheduler '{name}': score(…) is {shown}; {wanted}")
 
     @property
     def _power(self) -> Floats:

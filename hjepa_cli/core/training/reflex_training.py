@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.loop import STATE_LIMIT
 from hjepa_cli.core.networks.reflex import Reflex
-from hjepa_cli.core.plants.system import System
+from hjepa_cli.core.plants.system import System, Teacher
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,22 +25,24 @@ class Plans:
 
 def follow(
     kind: System,
+    act: Teacher,
     states: Floats,
     steps: int,
     *,
     sides: Floats | None = None,
     pushes_n: Floats | None = None,
 ) -> Plans:
-    """Let the teacher drive on from some states, without noise.
+    """Let a law drive on from some states, without noise.
 
     Args:
         kind: the plant.
+        act: the law.
         states: of the packets [N, S].
         steps: L.
         sides: factors on the forces [N, F], where pictures show these states mirrored.
         pushes_n: exploration added to the teacher's forces [N, L, *A]; none by default.
     """
-    act, limit_n = kind.teacher(), kind.force_limit_n
+    limit_n = kind.force_limit_n
     teacher = np.empty((len(states), steps, *kind.action_shape), np.float32)
     sent = teacher if pushes_n is None else np.empty_like(teacher)
     side = 1.0 if sides is None else sides.reshape(len(states), *kind.action_shape)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hjepa_cli.core.plants.frames import frames_seen
-from hjepa_cli.core.plants.system import System
+from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.core.training.batches import Labels
 
 
@@ -48,12 +48,11 @@ class RenderedSplit:
         return self.labels[:, ::every].flatten(0, 1)
 
 
-def labels_of(split: RenderedSplit, kind: System) -> Labels:
-    """Return the teacher's actions on a split: as recorded, or asked anew where pictures move.
+def labels_of(split: RenderedSplit, kind: System, act: Teacher) -> Labels:
+    """Return a law's actions on a split: as recorded, or asked anew where pictures move.
 
     The returned function raises a UsageError for a plant whose pictures cannot be moved.
     """
-    act = kind.teacher()
 
     def labels(trajectories: Tensor, k: Tensor, shifts_px: NDArray[np.int64]) -> Tensor:
         if not shifts_px.any():

@@ -22,10 +22,11 @@ if TYPE_CHECKING:
 def _decoded_at_the_controller(settings: Settings, model: Model) -> Driver:
     from hjepa_cli.core.control.drivers import coder_of, embedding_driver
     from hjepa_cli.core.control.kalman import KalmanController, fit_state_reader
+    from hjepa_cli.core.plants.control_law import control_law
 
     kind = PLANTS[model.plant_name]
     reader = fit_state_reader(model, settings, coder_of(settings, model).send)
-    controls = reader.filter, reader.read, kind.teacher(), kind.force_limit_n
+    controls = reader.filter, reader.read, control_law(kind, settings.control), kind.force_limit_n
     drives = functools.partial(KalmanController, *controls)
     return embedding_driver("state-kf", settings, model, drives, family="state-kf")
 
@@ -38,9 +39,11 @@ def _decoded_on_the_device(settings: Settings, model: Model) -> Driver:
     from hjepa_cli.core.control.kalman import KalmanController, fit_state_reader
     from hjepa_cli.core.control.sensors import embedding_sensor
     from hjepa_cli.core.plants.conditions import actual_camera
+    from hjepa_cli.core.plants.control_law import control_law
 
     kind, reader = PLANTS[model.plant_name], fit_state_reader(model, settings)
-    controls = reader.quantised, np.asarray, kind.teacher(), kind.force_limit_n
+    act = control_law(kind, settings.control)
+    controls = reader.quantised, np.asarray, act, kind.force_limit_n
     drives = functools.partial(KalmanController, *controls)
     camera = actual_camera(settings.plant, settings.conditions, settings.seed)
     embed = embedding_sensor(model, camera=camera)

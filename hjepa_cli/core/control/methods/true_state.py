@@ -1,7 +1,9 @@
 """Methods of this file get the true state, which no network limits.
 
 They tell what prediction could gain at best (``oracle``), what it has to beat (``hold-true``,
-``zero-true``), and what the teacher does at every step (``optimal``).
+``zero-true``), and what the teacher does at every step (``optimal``). All but ``optimal`` play the
+law that models learn; ``oracle-teacher`` plays the plant's own teacher, whatever models learn, and
+``ceiling`` the best law that was found without asking whether an actor can learn it.
 """
 
 from __future__ import annotations
@@ -17,38 +19,50 @@ if TYPE_CHECKING:
     from hjepa_cli.config.schema import Settings
     from hjepa_cli.core.control.drivers import Driver
     from hjepa_cli.core.networks.model import Model
-    from hjepa_cli.core.plants.system import System
+    from hjepa_cli.core.plants.system import System, Teacher
 
 
-def true_state_driver(name: str, kind: System, bits_per_transmission: int) -> Driver:
-    """Build one of this file's methods for a nominal plant: its teacher, and its equations.
+def true_state_driver(
+    name: str, kind: System, bits_per_transmission: int, act: Teacher | None = None
+) -> Driver:
+    """Build one of this file's methods for a nominal plant: a law, and its equations.
 
-    Bits are counted as if embeddings were sent, so that device counts differ by control alone.
+    ``act`` is the law, by default the plant's own teacher. Bits are counted as if embeddings were
+    sent, so that device counts differ by control alone.
     """
     from hjepa_cli.core.control.controllers import LastForce, Oracle
     from hjepa_cli.core.control.drivers import Driver
     from hjepa_cli.core.control.sensors import true_state
 
-    teacher = kind.teacher()
-    last_force = functools.partial(LastForce, teacher, action_shape=kind.action_shape)
+    family = "state"
+    if act is None or act is kind.teacher():
+        act = kind.teacher()
+    else:
+        family = "ceiling" if name == "ceiling" else "law"
+    last_force = functools.partial(LastForce, act, action_shape=kind.action_shape)
     reactive = functools.partial(last_force, keep=True)
     drives: Any = reactive
-    if name == "oracle":
-        states, limit_n = len(kind.state_names), kind.force_limit_n
-        drives = functools.partial(Oracle, teacher, kind.advance, limit_n, states=states)
+    if name in ("oracle", "oracle-teacher", "ceiling"):
+        states, shape = len(kind.state_names), kind.action_shape
+        exactly = functools.partial(Oracle, act, kind.advance, kind.force_limit_n)
+        drives = functools.partial(exactly, states=states, action_shape=shape)
     elif name == "zero-true":
         drives = functools.partial(last_force, keep=False)
     uses_link = name != "optimal"
-    return Driver(name, true_state, drives, reactive, bits_per_transmission, "state", uses_link)
+    return Driver(name, true_state, drives, reactive, bits_per_transmission, family, uses_link)
 
 
 def _method(name: str, style: Style, **about: Any) -> Method:
     def build(settings: Settings, model: Model | None) -> Driver:
+        from hjepa_cli.core.plants.control_law import ceiling_law, control_law
         from hjepa_cli.core.plants.named import plant
 
         embedding = model.architecture["embedding"] if model else settings.encoder.embedding
-        bits = CODECS[settings.protocol.payload].bits(embedding)
-        return true_state_driver(name, plant(settings.plant), bits)
+        bits, kind = CODECS[settings.protocol.payload].bits(embedding), plant(settings.plant)
+        act = None
+        if name not in ("optimal", "oracle-teacher"):
+            act = (ceiling_law if name == "ceiling" else control_law)(kind, settings.control)
+        return true_state_driver(name, kind, bits, act)
 
     return Method(name, "true state", build, style=style, **about)
 
@@ -57,3 +71,5 @@ HOLD_TRUE = _method("hold-true", Style("#7F7F7F", "v", ":", hollow=True, size=6.
 ZERO_TRUE = _method("zero-true", Style("#7F7F7F", "D", DASH_DOT_DOT, hollow=True, size=6.5))
 OPTIMAL = _method("optimal", Style("#000000", "x", ":"), needs_link=False, compared=True)
 ORACLE = _method("oracle", Style("#000000", "o", "-", hollow=True, size=8.5), compared=True)
+ORACLE_TEACHER = _method("oracle-teacher", Style("#7F7F7F", "o", "-.", hollow=True, size=8.5))
+CEILING = _method("ceiling", Style("#000000", "h", "-", hollow=True, size=8.5))

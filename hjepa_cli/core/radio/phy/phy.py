@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, Protocol
 
 from hjepa_cli.config.schema import NrSettings, RadioSettings
+from hjepa_cli.plugins import check_members
 
 Noise = Literal["fixed", "scaled"]
 
@@ -114,3 +115,9 @@ class Phy:
     layer: Callable[[RadioSettings, NrSettings, float], PhysicalLayer]
     uses: tuple[str, ...] = ()
     check: Callable[[RadioSettings, NrSettings], None] = lambda radio, nr: None
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for members that are of another kind."""
+        check_members(self, str, "help")
+        check_members(self, callable, "layer", "check")
+        check_members(self, tuple, "uses")
