@@ -162,11 +162,12 @@ class Rare:
 
         def run(normal: Floats, rows: Integers) -> Floats:
             noise = normal * scale
-            draws = Draws(
-                first.initial[rows],
-                noise,
-                np.zeros(noise.shape[:2]),
-                first.mass_scale[rows],
+            draws = dataclasses.replace(
+                first,
+                initial=first.initial[rows],
+                noise=noise,
+                delivery=np.zeros(noise.shape[:2]),
+                mass_scale=first.mass_scale[rows],
                 link=first.link.part(rows),
             )
             peak = np.zeros(len(rows))

@@ -67,7 +67,7 @@ class Scheduler:
     def __post_init__(self) -> None:
         """Raise UsageError for members that are of another kind."""
         check_members(self, callable, "score")
-        check_members(self, bool, "wants_reports")
+        check_members(self, bool, "wants_reports", "in_turn")
         check_members(self, Style, "style")
 
 
