@@ -12,6 +12,7 @@ per second and outcomes by kind; the first violation ends it with the seed that 
 import argparse
 import collections
 import copy
+import hashlib
 import io
 import json
 import random
@@ -40,8 +41,9 @@ from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.core.training import progress
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.errors import HjepaError, Unsealed
+from hjepa_cli.output import tables
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import data, models
+from hjepa_cli.stages import compare, data, models, report, results, resume
 from hjepa_cli.storage import files, runs, seals, shards, tensors, zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 
@@ -111,6 +113,14 @@ def mutate_json(value: Any, chance: random.Random) -> Any:
                 node[key] = copy.deepcopy(chance.choice(NASTY))
             break
     return changed
+
+
+def change_number(data: bytes, chance: random.Random) -> bytes:
+    """Put another digit in the place of one."""
+    digits = [at for at, byte in enumerate(data) if byte in b"0123456789"]
+    at = chance.choice(digits)
+    other = chance.choice([digit for digit in b"0123456789" if digit != data[at]])
+    return data[:at] + bytes([other]) + data[at + 1 :]
 
 
 class Target:
@@ -283,6 +293,128 @@ class Derived(Target):
         return found, runs.read_result(self.path), runs.read_config(self.path)
 
 
+class Shown(Target):
+    """Runs whose numbers are printed: those of others with a good seal, ours with a bad one.
+
+    A number that is changed behind a seal must be an error, or what is printed stays the same.
+    Values of any kind under a right seal must be an error or be printed.
+    """
+
+    FILES = (runs.RESULT, runs.ENVIRONMENT, runs.CONFIG, runs.METRICS, "curves.json")
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.runs = [self._evaluated(0), self._evaluated(1), self._scaled(), self._trained()]
+        self.page = report.page_template().make_module({"runs": (), "sections": (), "note": ""})
+        self.good = {run: self._bytes(run) for run in self.runs}
+        self.run, self.forged = self.runs[0], False
+        self.expected = {run: self._printed(run) for run in self.runs}
+
+    def damage(self, chance: random.Random) -> int:
+        for name, whole in self.good[self.run].items():
+            (self.run / name).write_bytes(whole)
+        self.run, self.forged = chance.choice(self.runs), chance.random() < 0.5
+        name = chance.choice(sorted(self.good[self.run]))
+        found = self.good[self.run][name]
+        if not self.forged:
+            return self._write(self.run / name, change_number(found, chance))
+        if name in (runs.CONFIG, runs.METRICS):
+            lie = mutate_bytes(found, chance)
+        else:
+            document = mutate_json(json.loads(found), chance)
+            has_seal = isinstance(document, dict) and "sha256" in document
+            lie = json.dumps(seals.sealed(document) if has_seal else document).encode()
+        size = self._write(self.run / name, lie)
+        if name not in (runs.RESULT, "curves.json"):  # which the result names
+            result = json.loads(self.good[self.run][runs.RESULT])
+            result["files"][name] = hashlib.sha256(lie).hexdigest()
+            self._write(self.run / runs.RESULT, json.dumps(seals.sealed(result)).encode())
+        return size
+
+    def read(self) -> None:
+        printed = self._printed(self.run)
+        assert self.forged or printed == self.expected[self.run], "printed another number"
+
+    def _printed(self, run: Path) -> Any:
+        one = report.describe(run)
+        one["figures"] = []
+        screen = Screen(stdout=io.StringIO(), stderr=io.StringIO())
+        try:
+            text = str(self.page.section(one))
+        except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+            raise results.damaged(run, one["stage"], error) from None
+        with results.showing(one["stage"], one["result"], run):
+            if one["stage"] == "eval":
+                tables.show_evaluation(one["result"], screen)
+            elif one["stage"] == "train-encoder":
+                tables.show_gates(screen, one["result"]["gates"], enforced=True)
+        compared = None
+        if one["stage"] == "eval":
+            compared = self._compared()
+            curves.read(run / "curves.json", DIGEST)
+        resume.recall(run, screen)
+        return text, screen._stdout.getvalue(), compared
+
+    def _compared(self) -> Any:
+        found = [compare.open_evaluation(run, None) for run in self.runs[:2]]
+        compare.check_alike(found)
+        by_method, _ = compare.collected(found, None)
+        averaged = {name: compare.averaged(list(of.values())) for name, of in by_method.items()}
+        return averaged, compare.differences(by_method)
+
+    def _bytes(self, run: Path) -> dict[str, bytes]:
+        return {name: (run / name).read_bytes() for name in self.FILES if (run / name).exists()}
+
+    def _evaluated(self, seed: int) -> Path:
+        measured = files.read_json(zoo.zoo_directory() / "desktop-h4m2l1" / "curves.json")
+        methods = {name: measured["methods"][name] for name in ("hjepa", "ts-jepa-4")}
+        directory, settings = self.path / f"eval-{seed}", load_settings("smoke").as_dict()
+        with runs.Run.create("eval", directory, settings) as run:
+            curves.write(directory / "curves.json", DIGEST, methods)
+            run.finish(
+                {
+                    "plant": "desktop", "seed": seed, "checkpoint": "m", "loop_version": 5,
+                    "acceptable_score": 0.62, "acceptable_lq_ratio": 0.5, "methods": methods,
+                    "horizon": list(range(len(methods["hjepa"]["nmae"]))),
+                    "training_seeds": dict.fromkeys(methods, seed), "source": "curves",
+                }
+            )  # fmt: skip
+        return directory
+
+    def _scaled(self) -> Path:
+        measured = files.read_json(zoo.zoo_directory() / "desktop-h4m2l1" / "curves.json")
+        rows = [
+            DUTY.row(
+                LinkRequirement.measured(DUTY.axis, name, measured["methods"][name]),
+                Cell(20e6, 0.001, 10.0),
+                snr_db,
+            )
+            for name in ("hjepa", "ts-jepa-4")
+            for snr_db in (10.0, 20.0)
+        ]
+        gain = {"method": "hjepa", "over": "ts-jepa-4", "snr_db": 20.0, "ratio": 1.1}
+        with runs.Run.create("scale", self.path / "scale", load_settings().as_dict()) as run:
+            run.finish(
+                {
+                    "plant": "desktop", "seed": 0, "law": "duty", "bandwidth_hz": 20e6,
+                    "slot_s": 0.001, "acceptable_score": 0.62, "n_devices": 64,
+                    "limit_bits_per_s": 13.2, "paper_gain_percent": 42.8, "rows": rows,
+                    "gains": [gain | {"ratio_ci95": [1.0, 1.2]}],
+                }
+            )  # fmt: skip
+        return run.directory
+
+    def _trained(self) -> Path:
+        gates = {"effective_rank": {"value": 9.5, "threshold": 4.0, "passed": True}}
+        with runs.Run.create(
+            "train-encoder", self.path / "trained", load_settings().as_dict()
+        ) as run:
+            for step in (1, 2):
+                run.metric({"step": step, "loss": 0.5 / step})
+            run.finish({"checkpoint": "m", "seconds": 12.5, "gates": gates})
+        return run.directory
+
+
 class Records(Target):
     """What a run and a collection remember: ``environment.json``, ``collecting.jsonl``."""
 
@@ -395,12 +527,13 @@ TARGETS: tuple[type[Target], ...] = (
     Dataset,
     Curves,
     Derived,
+    Shown,
     Records,
     Progress,
     Toml,
     Networks,
 )
-SHARES = (26, 22, 13, 6, 12, 8, 12, 1)  # in percent; a model takes as long as a hundred others
+SHARES = (25, 20, 12, 6, 5, 11, 8, 12, 1)  # in percent; a model takes as long as a hundred others
 
 
 def seal(arrays: dict[str, Any], metadata: Any, chance: random.Random) -> bytes:

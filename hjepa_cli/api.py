@@ -23,6 +23,7 @@ from hjepa_cli.core.datasets import dataset as datasets
 from hjepa_cli.core.evaluation import cell_simulation as cell_loop
 from hjepa_cli.core.evaluation.load_simulator import CALIBRATION_SEED
 from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.networks.outside import embeddings_from
 from hjepa_cli.core.plants.conditions import actual_plant
 from hjepa_cli.core.radio.uplink import Access
 from hjepa_cli.errors import UsageError
@@ -34,7 +35,7 @@ Values = Mapping[str, Any]
 
 
 def load_model(name_or_path: str | Path, *, device: str = "cpu") -> Model:
-    """Load a trained model, verified; it has ``encode(frames)``, ``actor(z)``, ``planner(method)``.
+    """Load a trained model, verified; it has ``encode(frames)`` and ``actor(z)``.
 
     Args:
         name_or_path: a name of the zoo (``hjepa models list``), a run directory, or a file.
@@ -59,7 +60,7 @@ def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tu
 
     Args:
         model: of :func:`load_model`.
-        z: the last received embeddings [n, D].
+        z: the last received embeddings [n, D], a tensor or an array.
         steps: control steps, at least 1; they are played in whole strides.
         method: a predictor that the model holds.
 
@@ -69,10 +70,12 @@ def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tu
 
     Raises:
         UsageError: no such predictor, or no step.
+        ArrayError: ``z`` is of another type or shape.
+        NumericalError: an embedding is not finite.
     """
     check_count("steps", steps)
     planner = planner_of(model, method)
-    z = z.to(model.device)
+    z = embeddings_from(z, model.architecture["embedding"]).to(model.device)
     forces_n = []
     for _ in range(-(-steps // planner.stride)):
         played, z = planner.plan(z)
@@ -94,7 +97,7 @@ def drive(
 
     Args:
         method: as on the command line; those on embeddings need ``model``. Packets of ``hold+9``
-            come 9 steps late, and the controller takes them for fresh.
+            come 9 steps later than the settings' ``protocol.delay_steps`` say.
         model: of :func:`load_model`, of the same plant.
         gap_steps: a packet every so many steps; or
         delivery: a packet at every step that arrives with this probability. Neither: all arrive.
@@ -106,7 +109,8 @@ def drive(
         ``score`` [n] (share inside the band) and ``cost`` [n] (mean capped quadratic cost).
 
     Raises:
-        UsageError: unknown method, both kinds of link, or no device.
+        UsageError: unknown method, both kinds of link, no device, or packets that come later than
+            the controller remembers.
         DataError: ``model`` is of another plant.
     """
     check_count("devices", devices)
@@ -122,7 +126,7 @@ def drive(
     seen: list[tuple[Floats, Floats]] = []
     outcome = simulate(
         actual_plant(chosen.plant, chosen.conditions),
-        draws,
+        how.draws(draws),
         (schedule if how.uses_link else np.ones_like(schedule))[None],
         how.controller(devices),
         how.sensor,

@@ -4,6 +4,10 @@ An :class:`HjepaError` is printed as one line (what was wrong, where, the valid 
 optional hint (the command to run next); it never shows a traceback. Codes follow sysexits.h.
 """
 
+import difflib
+import os
+import shlex
+from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 
 
@@ -18,9 +22,27 @@ class HjepaError(Exception):
 
 
 class UsageError(HjepaError):
-    """A flag, a setting or a combination of them is wrong."""
+    """A flag, a setting, a plugin or a combination of them is wrong.
+
+    ``key`` is that of the setting, where it is one that may come from a file.
+    """
 
     exit_code = 2
+
+    def __init__(self, message: str, *, hint: str | None = None, key: str | None = None) -> None:
+        super().__init__(message, hint=hint)
+        self.key = key
+
+    def locate(self, place: Callable[[str], str]) -> None:
+        """Write, once, where the setting was set: after what is wrong, before the choices."""
+        if self.key is not None:
+            head, sign, choices = self.message.partition("; ")
+            self.message = f"{head}{place(self.key)}{sign}{choices}"
+            self.args, self.key = (self.message,), None
+
+
+class ArrayError(UsageError, ValueError):
+    """An array from outside has another shape, type or range than a function takes."""
 
 
 class DataError(HjepaError):
@@ -33,6 +55,31 @@ class MissingInputError(HjepaError):
     """A dataset, checkpoint or model is not there."""
 
     exit_code = 66
+
+
+def shell(words: Iterable[object]) -> str:
+    """Return a command as a shell takes it back, in one line and whatever bytes are in a path."""
+    return " ".join(map(_quoted, map(str, words)))
+
+
+def _quoted(word: str) -> str:
+    if word.isprintable():
+        return shlex.quote(word)
+    plain = (
+        chr(b) if 32 <= b < 127 and b not in b"'\\" else f"\\x{b:02x}" for b in os.fsencode(word)
+    )
+    return f"$'{''.join(plain)}'"
+
+
+def meant(name: object, names: Iterable[str]) -> str:
+    """Ask whether the nearest of some names was meant, for a message; ``""`` where none is near."""
+    near = difflib.get_close_matches(str(name), names, n=1)
+    return f"did you mean '{near[0]}'? " if near else ""
+
+
+def choices(name: object, names: Iterable[str], verb: str = "choose from") -> str:
+    """Say what a name may be, for a message: the nearest first, then all."""
+    return f"{meant(name, names := list(names))}{verb} {', '.join(names)}"
 
 
 def require(module: str, what: str, extra: str, instead: str = "") -> None:
@@ -51,6 +98,12 @@ class Unavailable(HjepaError):
 
 class NumericalError(HjepaError):
     """Training diverged, or a stage gate failed."""
+
+    exit_code = 70
+
+
+class OutOfMemory(HjepaError):
+    """What was asked for does not fit into memory."""
 
     exit_code = 70
 
@@ -75,6 +128,10 @@ class LockedError(HjepaError):
 
 class Unsealed(UserWarning):
     """A file of an older version has no seal: nobody can tell whether it was changed."""
+
+
+class Unlocked(UserWarning):
+    """A file system has no locks: nobody can tell whether another process works in a directory."""
 
 
 class Interrupted(HjepaError):

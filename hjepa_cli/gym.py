@@ -7,6 +7,7 @@ cart has left the picture, because agents learn little from a pole on the floor.
 """
 
 import math
+from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,11 +24,12 @@ from gymnasium import spaces
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.checks import check_count
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.arrays import described
 from hjepa_cli.core.control.loop import STATE_LIMIT, noise_per_step
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.plants.named import Camera, CartPole
-from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.errors import ArrayError, NumericalError, UsageError
 
 Observation = NDArray[Any]
 REWARDS = ("lq", "score")
@@ -100,7 +102,10 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply a force for ``action_repeat`` control steps; raise NumericalError if not finite."""
         kind, limit_n = self._kind, self._kind.force_limit_n
-        share = float(np.asarray(action, float).reshape(-1)[0])
+        forces = np.asarray(action, float)
+        if forces.size != 1:
+            raise ArrayError(f"the action: {described(forces)}; expected one number, in -1 to 1")
+        share = float(forces.reshape(-1)[0])
         if not math.isfinite(share):
             raise NumericalError(f"the action is not finite at step {self._k}: {share}")
         force_n = min(max(share, -1.0), 1.0) * limit_n
@@ -154,7 +159,7 @@ class CartPolePixelsEnv(CartPoleEnv):
         return self._frame()
 
 
-class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any]):
+class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """This uplink loses observations: the agent then sees the last one that got through.
 
     The first observation of an episode always arrives. ``info`` has ``delivered`` and
@@ -168,8 +173,11 @@ class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], delivery_probability: float) -> None:
+        # For ``spec``, from which ``gymnasium.make`` makes it again.
+        kept = {"delivery_probability": delivery_probability}
+        gymnasium.utils.RecordConstructorArgs.__init__(self, **kept)
         super().__init__(env)
-        if not 0 <= delivery_probability <= 1:
+        if not (isinstance(delivery_probability, Real) and 0 <= delivery_probability <= 1):
             raise UsageError(f"delivery_probability = {delivery_probability}; expected 0 to 1")
         self.delivery_probability = delivery_probability
         self._received: Any = None
@@ -198,5 +206,6 @@ class LossyChannel(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._received, reward, terminated, truncated, info
 
 
-gymnasium.register("hjepa/CartPole-v0", entry_point=CartPoleEnv)
-gymnasium.register("hjepa/CartPolePixels-v0", entry_point=CartPolePixelsEnv)
+# By name, so that a ``spec`` can be written down, and made again elsewhere.
+gymnasium.register("hjepa/CartPole-v0", entry_point="hjepa_cli.gym:CartPoleEnv")
+gymnasium.register("hjepa/CartPolePixels-v0", entry_point="hjepa_cli.gym:CartPolePixelsEnv")

@@ -17,15 +17,18 @@ import dataclasses
 import hashlib
 import importlib
 import importlib.metadata
+import re
 import sys
+import traceback
 import types
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.errors import MissingInputError, UsageError, choices
 
 GROUP = "hjepa.plugins"
+LIMIT_BYTES = 2**20  # of a file that a person names and writes by hand
 
 _CONTROL = "hjepa_cli.core.control"
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -48,10 +51,12 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "scheduled": "hjepa_cli.core.radio.laws.scheduled:SCHEDULED",
     },
     "stage": {
+        "tune-law": "hjepa_cli.stages.pipeline:TUNE_LAW",
         "collect": "hjepa_cli.stages.pipeline:COLLECT",
         "train-encoder": "hjepa_cli.stages.pipeline:TRAIN_ENCODER",
         "train-hierarchy": "hjepa_cli.stages.pipeline:TRAIN_HIERARCHY",
         "train-reflex": "hjepa_cli.stages.pipeline:TRAIN_REFLEX",
+        "train-fusion": "hjepa_cli.stages.pipeline:TRAIN_FUSION",
         "eval": "hjepa_cli.stages.pipeline:EVAL",
         "scale": "hjepa_cli.stages.pipeline:SCALE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
@@ -65,6 +70,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "method": {
         "hjepa": f"{_CONTROL}.methods.predictors:HJEPA",
+        "hjepa-fused": f"{_CONTROL}.methods.predictors:HJEPA_FUSED",
         **{f"ts-jepa-{h}": f"{_CONTROL}.methods.predictors:TS_JEPA" for h in range(1, 6)},
         "supervised-2": f"{_CONTROL}.methods.raw_frames:SUPERVISED_2",
         "supervised-4": f"{_CONTROL}.methods.raw_frames:SUPERVISED_4",
@@ -96,6 +102,13 @@ CLASSES = {  # what extensions are made with, those with families too
     "method": (f"{_CONTROL}.methods.method:Method", f"{_CONTROL}.methods.method:MethodFamily"),
     "law": ("hjepa_cli.core.radio.laws.law:SharingLaw",),
     "stage": ("hjepa_cli.stages.stage:Stage",),
+}
+
+
+NAME = re.compile(r"\w[\w.-]{0,63}")  # goes into flags, lists between commas and paths
+TAKEN = {  # names that mean something else where such a name may stand
+    "stage": ("resume", "view", "report", "compare", "data", "models", "config"),
+    "plant": ("default", "paper", "smoke"),
 }
 
 
@@ -142,9 +155,23 @@ class Registry:
         """
         place = self._place(name)
         if place is None:
-            raise UsageError(f"unknown {self.kind} '{name}'; choose from {', '.join(self)}")
+            raise self.unknown(name)
         item = self._load(place)
-        return item.member(name) if _is_family(item) else item
+        if not _is_family(item):
+            return item
+        made = item.member(name)
+        if not isinstance(made, _imported(CLASSES[self.kind][0])) or made.name != name:
+            raise self.fault(place, f"{self.kind}s {place}: member('{name}') made {made!r}")
+        return made
+
+    def unknown(self, name: str, key: str | None = None) -> UsageError:
+        """Return the error for a name that there is not, in the setting ``key``."""
+        return UsageError(f"unknown {self.kind} '{name}'; {choices(name, self)}", key=key)
+
+    def fault(self, name: str, what: str) -> UsageError:
+        """Return the error for what an extension returned and may not, with where it came from."""
+        source = self._added[name][1] if name in self._added else self.source(name)
+        return UsageError(f"plugin {source.name}: {what}" if source else what)
 
     def values(self) -> list[Any]:
         """Return the extensions themselves, each once; of a family the family."""
@@ -156,12 +183,19 @@ class Registry:
         return self._added[place][1] if place in self._added else None
 
     def add(self, item: Any, source: Source | None) -> None:
-        """Take up an extension under its ``name``. Raises UsageError where that is taken."""
+        """Take up an extension under its ``name``.
+
+        Raise UsageError where that is taken, or no word that a flag, a list or a path can carry.
+        """
         name = getattr(item, "name", None)
-        if not isinstance(name, str) or not name:
-            raise UsageError(f"a {self.kind} without a name: {item!r}")
-        if name in [*self._own, *self._added] or name in self:
-            raise UsageError(f"there is a {self.kind} called '{name}' already; choose another name")
+        if not isinstance(name, str) or not NAME.fullmatch(name):
+            raise UsageError(
+                f"a {self.kind} cannot be called {name!r}; choose a name of up to 64 letters, "
+                "digits, '_', '-' and '.' that begins with a letter or a digit"
+            )
+        if name in [*self._own, *self._added, *TAKEN.get(self.kind, ())] or name in self:
+            taken = "something else" if name in TAKEN.get(self.kind, ()) else f"a {self.kind}"
+            raise UsageError(f"there is {taken} called '{name}' already; choose another name")
         self._added[name] = item, source
 
     def _place(self, name: str) -> str | None:
@@ -186,6 +220,23 @@ def _imported(place: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
+def check_members(item: Any, kind: Any, *names: str, optional: bool = False) -> None:
+    """Raise UsageError for a member of an extension that is not of a kind.
+
+    The kind is a class, or ``callable`` for functions; ``None`` will do where it is ``optional``.
+    """
+    for name in names:
+        value = getattr(item, name, None)
+        if optional and value is None:
+            continue
+        if not (callable(value) if kind is callable else isinstance(value, kind)):
+            kinds = kind if isinstance(kind, tuple) else (kind,)
+            wanted = " or ".join("function" if one is callable else one.__name__ for one in kinds)
+            raise UsageError(
+                f"{type(item).__name__} '{item.name}': {name} = {value!r} is no {wanted}"
+            )
+
+
 def _is_family(item: Any) -> bool:
     return hasattr(item, "member")
 
@@ -207,6 +258,8 @@ def register(*items: Any) -> None:
     for item in items:
         for kind, places in CLASSES.items():
             if isinstance(item, tuple(map(_imported, places))):
+                if kind == "plant":  # the others check themselves when they are made
+                    item.check_members()
                 _REGISTRIES[kind].add(item, _loading.get())
                 break
         else:
@@ -223,7 +276,7 @@ def load_file(path: Path) -> Source:
             and nothing of the file stays registered.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path)
     except FileNotFoundError:
         raise MissingInputError(f"plugin {path} does not exist") from None
     except (OSError, ValueError) as error:
@@ -233,12 +286,32 @@ def load_file(path: Path) -> Source:
     return source
 
 
+def read_regular(path: Path) -> str:
+    """Return the text of a file that a person named.
+
+    Raise OSError where it cannot be read, ValueError where it is none, or too large.
+    """
+    if path.exists() and not path.is_file():  # a pipe, or a device that never ends
+        raise ValueError("not a regular file")
+    if path.stat().st_size > LIMIT_BYTES:
+        raise ValueError(f"larger than {LIMIT_BYTES} bytes")
+    return path.read_text(encoding="utf-8-sig")  # editors of some systems begin with a mark
+
+
 def ensure(sources: Iterable[Source]) -> None:
     """Load files as :func:`load_file`, from the text that another process has read."""
     load_installed()
     for source in sources:
         if source.text is not None and source.sha256 not in {one.sha256 for one in _sources}:
             _run(source, source.text)
+
+
+def blamed(error: BaseException) -> str | None:
+    """Return where in a plugin's file an error arose, here or in a worker, as ``FILE:LINE``."""
+    files = "|".join(re.escape(source.name) for source in _sources if source.text is not None)
+    text = "".join(traceback.format_exception(error))  # a worker's is in there as text
+    found = re.findall(rf'^[ |]*File "({files})", line (\d+)', text, re.MULTILINE) if files else ()
+    return ":".join(found[-1]) if found else None
 
 
 def in_force() -> tuple[Source, ...]:
@@ -259,7 +332,7 @@ def load_installed() -> None:
     for point in importlib.metadata.entry_points(group=GROUP):
         name = f"{point.dist.name} {point.dist.version}" if point.dist else point.value
         source = Source(name, _digest(name))
-        with _transaction(source, name, hint=f"pip uninstall {name.split()[0]}"):
+        with _transaction(source, name, f"pip uninstall {name.split()[0]}"):
             point.load()
 
 
@@ -272,7 +345,7 @@ def _run(source: Source, text: str) -> None:
     name = f"hjepa_plugin_{Path(source.name).stem}_{source.sha256[:8]}"
     module = types.ModuleType(name, f"The plugin {source.name}.")
     module.__file__ = source.name
-    with _transaction(source, source.name):
+    with _transaction(source, source.name, f"correct {source.name}, or leave out --plugin"):
         for registry in _REGISTRIES.values():  # what an earlier text of this file registered
             kept = registry._added.items()
             registry._added = {
@@ -287,19 +360,26 @@ def _run(source: Source, text: str) -> None:
 
 
 @contextlib.contextmanager
-def _transaction(source: Source, file: str, hint: str | None = None) -> Iterator[None]:
-    """Register all or nothing; every error becomes a line that names the file and the line."""
+def _transaction(source: Source, file: str, hint: str) -> Iterator[None]:
+    """Register all or nothing; every error becomes a line that names the file and the line.
+
+    A plugin that ends the program is an error too. What it prints goes to stderr: stdout is for
+    results.
+    """
     before = {kind: dict(one._added) for kind, one in _REGISTRIES.items()}
     token = _loading.set(source)
     try:
-        yield
-    except Exception as error:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except BaseException as error:
         for kind, added in before.items():
             _REGISTRIES[kind]._added = added
+        if isinstance(error, KeyboardInterrupt):
+            raise
         name, lines = type(error).__name__, str(error).splitlines()
         reason = f"{name}: {lines[0]}" if lines and lines[0] else name
         if isinstance(error, UsageError):
-            reason = error.message
+            reason, hint = error.message, error.hint or hint
         raise UsageError(f"plugin {_place(error, file)}: {reason}", hint=hint) from None
     else:
         _sources[:] = [one for one in _sources if one.name != source.name] + [source]
@@ -307,7 +387,7 @@ def _transaction(source: Source, file: str, hint: str | None = None) -> Iterator
         _loading.reset(token)
 
 
-def _place(error: Exception, file: str) -> str:
+def _place(error: BaseException, file: str) -> str:
     """Return ``FILE:LINE`` of the plugin where an error came from."""
     line = error.lineno if isinstance(error, SyntaxError) and error.filename == file else None
     trace = error.__traceback__

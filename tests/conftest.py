@@ -1,11 +1,8 @@
-"""Settings shared by all tests: the same examples on every machine, and no window system."""
+"""Settings shared by all tests: the same examples on every machine."""
 
-import os
 import signal
 
 from hypothesis import settings
-
-os.environ.setdefault("MPLBACKEND", "Agg")
 
 # A shell's background jobs ignore Ctrl-C, and so would every process that a test starts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

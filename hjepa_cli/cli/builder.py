@@ -83,8 +83,9 @@ def _callback(command: Command) -> Callable[..., None]:
 
     parameters = []
     for name in command.all_taken:
-        one = taken(name)
-        word = name.partition(":")[0] if name in INPUTS else SETTING + name.replace(".", "__")
+        one = command.own.get(name) or taken(name)
+        is_input = name in INPUTS or name in command.own
+        word = name.partition(":")[0] if is_input else SETTING + name.replace(".", "__")
         default = inspect.Parameter.empty if one.default is ... else one.default
         how = {"default": default, "annotation": annotation(one)}
         parameters.append(inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, **how))

@@ -5,10 +5,10 @@ program is made of this list in :mod:`hjepa_cli.cli.builder`.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from hjepa_cli.cli.flags import INPUTS
+from hjepa_cli.cli.flags import INPUTS, Input, stage_input
 from hjepa_cli.config.checks import check_cell, compared_methods
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import origins
@@ -26,6 +26,7 @@ GROUPS = {
 RESOLVED = ("preset", "config", "plant", "seed")  # what takes these is given settings
 COMPUTED = (*RESOLVED, "device")
 PARALLEL = ("workers", "cluster")
+SHARED = ("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify")  # by stages
 LOOP = ("methods", "protocol")
 LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss")
 MEASURED = (
@@ -53,6 +54,7 @@ class Command:
         prepare: changes what was given before settings are made of it.
         check: refuses what does not go with the settings, or adds what follows from both.
         panel: where the program's help lists a command that is in no group.
+        own: what it takes that no other command does, by the names in ``takes``.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Command:
     prepare: Callable[[Given], None] | None = None
     check: Callable[[Settings, Given], None] | None = None
     panel: str = PIPELINE
+    own: Mapping[str, Input] = dataclasses.field(default_factory=dict)
 
     @property
     def resolves(self) -> bool:
@@ -142,11 +145,14 @@ SCALE = (
 
 
 def staged(name: str, takes: tuple[str, ...] = (), further: str = "", **more: Any) -> Command:
-    """Return the command of a stage, which says itself what it does; takes what a plugin's may."""
-    one = STAGES[name]
-    words = takes or (*(word for word in one.inputs if word in INPUTS), "out", *COMPUTED)
+    """Return the command of a stage, which says itself what it does, and what a plugin's takes."""
+    one, own = STAGES[name], {}
+    if not takes:
+        words = [word for word in one.inputs if word != "further"]
+        own = {word: stage_input(word, one.default(word)) for word in words if word not in SHARED}
+        takes = (*words, "out", *COMPUTED)
     text = f"{one.help}\n\n{further}".strip()
-    return Command(name, text, one.run, words, one.plan, one.product, one.shared, **more)
+    return Command(name, text, one.run, takes, one.plan, one.product, one.shared, own=own, **more)
 
 
 def commands() -> tuple[Command, ...]:
@@ -163,6 +169,7 @@ COMMANDS = (
             *("collect.frames", "out", *RESOLVED, *PARALLEL),
         ),
     ),
+    staged("tune-law", takes=("out", *RESOLVED), panel=TOOLS),
     staged(
         "train-encoder",
         takes=(
@@ -181,6 +188,12 @@ COMMANDS = (
         further="Methods hold-decay, hold-decay-linear, chunk and chunk-forces, on a trained "
         "model's encoder.",
         takes=("dataset", "checkpoint", "out", *COMPUTED),
+    ),
+    staged(
+        "train-fusion",
+        further="Conditions are those of [conditions] and payload in --config FILE.toml.",
+        takes=("protocol.payload", "dataset", "checkpoint", "out", *COMPUTED),
+        panel=TOOLS,
     ),
     staged(
         "eval",

@@ -1,6 +1,8 @@
 """The shell offers names that lie on this disk when TAB is pressed, read without torch."""
 
 import contextlib
+import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from hjepa_cli.errors import HjepaError
@@ -26,6 +28,36 @@ def datasets(incomplete: str) -> list[str]:
 def runs(incomplete: str) -> list[str]:
     """Return finished runs, else directories."""
     return parents("runs/**/result.json", incomplete) or files(incomplete)
+
+
+def resumable(incomplete: str) -> list[str]:
+    """Return unfinished runs and collections, else directories."""
+    begun = parents("runs/*/*/config.toml", incomplete)
+    found = [run for run in begun if not Path(run, "result.json").exists()]
+    return found + parents("data/*/collecting.jsonl", incomplete) or files(incomplete)
+
+
+def several(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Return what completes the last of some names between commas, each of which comes once."""
+
+    def complete(incomplete: str) -> list[str]:
+        before, comma, last = incomplete.rpartition(",")
+        left = [name for name in names() if name not in before.split(",")]
+        return [f"{before}{comma}{name}" for name in matching(left, last)]
+
+    return complete
+
+
+def payloads(incomplete: str) -> list[str]:
+    """Return names of codecs, also those of a family; of one with numbers of its own the begin."""
+    from hjepa_cli.plugins import CODECS
+
+    names: list[str] = []
+    for name in CODECS:
+        family = name[: re.match(r"[a-z-]*", name).end()]  # type: ignore[union-attr]
+        members = (f"{family}{number}" for number in range(2, 33))
+        names += [one for one in (name, *members) if " " not in one and one in CODECS] or [family]
+    return matching(list(dict.fromkeys(names)), incomplete)
 
 
 def settings(incomplete: str) -> list[str]:

@@ -4,29 +4,27 @@ Imports nothing heavy; see :mod:`hjepa_cli.cli.commands`.
 """
 
 import inspect
+import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
+from pathlib import Path
 
 from hjepa_cli.cli.commands import Command, Given
-from hjepa_cli.compute import torchrun
+from hjepa_cli.compute import memory, torchrun
 from hjepa_cli.compute.interrupts import exit_code, sigterm_raises
 from hjepa_cli.config.checks import resolve
 from hjepa_cli.config.schema import declared
-from hjepa_cli.errors import HjepaError, Interrupted, StorageError, Unsealed
+from hjepa_cli.config.settings import locate
+from hjepa_cli.errors import Interrupted, Unlocked, Unsealed, UsageError
 from hjepa_cli.output.screen import Screen
-
-
-class PipeClosed(HjepaError):
-    """Whoever read our output has gone, as in ``hjepa scale | head -1``: we end without a word."""
-
-    exit_code = StorageError.exit_code
+from hjepa_cli.stages.plan import Plan
 
 
 def execute(command: Command, given: Given) -> None:
     """Run a command's stage, or show its plan, and print what it returns."""
     screen = Screen(given.pop("quiet"), given.pop("json"))
-    with _guard(screen):
+    with _guard(screen), _locating(command, given):
         del given["plugin"]  # loaded before the commands were listed
         dry_run, _ = given.pop("dry_run", False), given.pop("debug")
         parallel = "workers" in given
@@ -39,10 +37,17 @@ def execute(command: Command, given: Given) -> None:
         if dry_run and command.plan is not None:
             plan = getattr(command.plan, "function", command.plan)
             wanted = inspect.signature(plan).parameters.keys() & inputs.keys()
-            plan(**{name: inputs[name] for name in wanted}).show(screen)
+            planned = plan(**{name: inputs[name] for name in wanted})
+            if not isinstance(planned, Plan):
+                raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")
+            memory.check(planned.memory_bytes, command.name)
+            planned.show(screen)
             return
-        with _placed(workers, cluster) if parallel else nullcontext():
+        prints = redirect_stdout(sys.stderr) if screen.json else nullcontext()  # a plugin's
+        with _placed(workers, cluster) if parallel else nullcontext(), prints:
             result = command.run(**inputs)
+        if not isinstance(result, dict):
+            raise UsageError(f"{command.name} returned {result!r}; expected a dict, for --json")
         if torchrun.follows():
             return
         if screen.json:
@@ -60,9 +65,7 @@ def _placed(workers: int | None, cluster: str | None) -> AbstractContextManager[
 
 def _settings(command: Command, given: Given) -> Given:
     """Return what was given with the settings in place of what they are made of."""
-    preset, config = given["preset"], given["config"]
-    flags = {key: given[key] for key in given if key in declared() or key == "protocol"}
-    del flags["preset"]
+    preset, config, flags = _layers(given)
     settings = resolve(preset, config, flags)
     if command.check is not None:
         command.check(settings, given)
@@ -70,17 +73,33 @@ def _settings(command: Command, given: Given) -> Given:
     return {"settings": settings, **others}
 
 
+def _layers(given: Given) -> tuple[str | None, Path | None, Given]:
+    """Return the preset, the file and the flags that settings are made of."""
+    flags = {key: given[key] for key in given if key in declared() or key == "protocol"}
+    return flags.pop("preset"), given["config"], flags
+
+
+@contextmanager
+def _locating(command: Command, given: Given) -> Iterator[None]:
+    """Name the file and the line of a setting that is found wrong at any time."""
+    try:
+        yield
+    except UsageError as error:
+        if command.resolves:
+            locate(error, *_layers(given))
+        raise
+
+
 @contextmanager
 def _guard(screen: Screen) -> Iterator[None]:
     """Catch what Typer would turn into exit codes of its own, and say warnings in our words."""
     try:
         with sigterm_raises(), warnings.catch_warnings():
-            warnings.simplefilter("default", Unsealed)
+            for ours in (Unsealed, Unlocked):
+                warnings.simplefilter("default", ours)
             warnings.showwarning = lambda message, *_, **__: screen.say(f"warning: {message}")
             yield
     except KeyboardInterrupt as error:
         raise Interrupted(
             "interrupted", hint="run the same command again", code=exit_code(error)
         ) from None
-    except BrokenPipeError:
-        raise PipeClosed("output closed") from None

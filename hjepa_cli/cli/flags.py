@@ -4,6 +4,7 @@ Those that override a setting follow from its declaration in :mod:`hjepa_cli.con
 others are declared here. A flag that is not given is ``None`` and changes nothing.
 """
 
+import contextlib
 import dataclasses
 import typing
 from collections.abc import Callable, Iterable, Mapping
@@ -26,6 +27,7 @@ from hjepa_cli.config.schema import (
     must_be,
 )
 from hjepa_cli.config.settings import PRESETS, PROTOCOLS
+from hjepa_cli.errors import MissingInputError
 from hjepa_cli.plugins import LAWS, METHODS, PLANTS, SCHEDULERS
 
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
@@ -75,6 +77,12 @@ def written_path(text: str | Path) -> Path:
     """Parse a path to write to; an empty one, of an unset variable, would be this directory."""
     if not str(text).strip():
         raise typer.BadParameter("an empty path; leave the flag out, or name a place")
+    return Path(text)
+
+
+def _read_path(text: str | Path) -> Path:
+    if not str(text).strip() or not Path(text).exists():
+        raise MissingInputError(f"'{text}' does not exist")
     return Path(text)
 
 
@@ -128,12 +136,19 @@ _FILES = {
         "A,B",
         default="pdf",
     ),
-    "dataset": Input(Path, "--dataset", "Dataset to read. Without it: the newest in data/.", "DIR"),
+    "dataset": Input(
+        Path,
+        "--dataset",
+        "Dataset to read. Without it: the newest in data/.",
+        "DIR",
+        complete=completion.datasets,
+    ),
     "dataset:clean": Input(
         Path,
         "--dataset",
         "Dataset whose clean rollouts to predict. Without it: simulated again from the seed.",
         "DIR",
+        complete=completion.datasets,
     ),
     "encoder": _model(
         "--encoder",
@@ -145,7 +160,7 @@ _FILES = {
     ),
 }
 _ARGUMENTS = {
-    "directory": _argument(Path, "The run's directory.", "RUN", default=...),
+    "directory": _argument(Path, "The run's directory.", "RUN", completion.resumable, default=...),
     "name_or_path": _argument(
         str, "A zoo name or a path.", "NAME|PATH", completion.models, default=...
     ),
@@ -218,6 +233,7 @@ _LOOP = {
         "--methods",
         "Only these, separated by commas: the first against the others. Without it: all found.",
         "A,B,C",
+        complete=completion.several(lambda: METHODS),
     ),
     "methods:view": Input(
         tuple[str, ...],
@@ -225,6 +241,7 @@ _LOOP = {
         "Methods on embeddings, one row each, separated by commas.",
         "A,B,C",
         default="hjepa,hold",
+        complete=completion.several(lambda: METHODS),
     ),
     "devices": Input(Count, "--devices", "Devices side by side.", default=3),
     "every": Input(
@@ -446,7 +463,8 @@ _SETTINGS = {
     "plugin": Input(
         list[Path],
         "--plugin",
-        "Python file that adds plants, codecs, schedulers, methods or laws; may be repeated.",
+        "Python file that adds plants, codecs, schedulers, methods, laws or stages; may be "
+        "repeated.",
         "FILE.py",
         default=[],
     ),
@@ -474,9 +492,25 @@ def taken(name: str) -> Input:
     hint = declared()[name]
     flag = flag_of(hint)
     assert flag is not None, f"{name} has no flag"
-    offered = None if flag.metavar or name not in NAMES else lambda: list(NAMES[name])
+    offered: Callable[..., list[str]] | None = None
+    if name in NAMES:
+        listed = typing.get_origin(bare(hint)) is tuple
+        named = lambda: list(NAMES[name])  # noqa: E731
+        offered = completion.several(named) if listed else named
+    elif name == "protocol.payload":
+        offered = completion.payloads
     panel = LOOP if name == "methods" else PANELS[name.rpartition(".")[0]]
     return Input(hint, **vars(flag), complete=offered, panel=panel)
+
+
+def stage_input(word: str, default: Any) -> Input:
+    """Return the flag of an input of a plugin's stage: a switch, or a path that is there."""
+    flag, text = f"--{word.replace('_', '-')}", word.replace("_", " ").capitalize()
+    if default is False:
+        one = _switch(flag, f"{text}.")
+    else:
+        one = Input(Path, flag, f"{text} to read.", "PATH", default=default, parse=_read_path)
+    return dataclasses.replace(one, panel=FILES)
 
 
 def annotation(one: Input) -> Any:
@@ -516,9 +550,19 @@ def parser(kind: Any, unit: float = 1.0) -> Callable[[Any], Any] | None:
             value = float(text) * unit if plain is float else int(text) if plain is int else text
             return msgspec.convert(value, kind)
         except (ValueError, OverflowError, msgspec.ValidationError):
-            raise typer.BadParameter(f"'{text}' is not {must_be(kind, unit)}") from None
+            wrong = f"'{text}' is not {must_be(kind, unit)}"
+            if unit != 1.0 and _fits(text, kind):  # in the setting's own unit, not in the flag's
+                wrong += f"; did you mean {float(text) / unit:g}?"
+            raise typer.BadParameter(wrong) from None
 
     return parse
+
+
+def _fits(text: Any, kind: Any) -> bool:
+    with contextlib.suppress(ValueError, OverflowError, msgspec.ValidationError):
+        msgspec.convert(float(text), kind)
+        return True
+    return False
 
 
 def split_names(text: str) -> list[str]:

@@ -5,9 +5,11 @@ settings, seed and index alone, so that results do not depend on where or in whi
 may be computed twice after a failure.
 """
 
+import asyncio
 import dataclasses
 import functools
 import importlib.util
+import json
 import logging
 import multiprocessing
 import os
@@ -15,7 +17,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -33,6 +42,7 @@ IN_FLIGHT = 4  # units submitted per worker: enough to keep it busy, few enough 
 LOCAL = "local"
 RETRIES = 3  # of a unit whose Dask worker died
 CONNECT_S = 10
+LONGEST_GREETING = 2**20  # bytes of the first message of a Dask scheduler
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -158,7 +168,8 @@ def worker_pool(
     others = set(multiprocessing.active_children())  # of the program that calls us
     begin = plugins.in_force(), initializer, *arguments
     with spawning():
-        pool = ProcessPoolExecutor(count, context, initializer=with_plugins, initargs=begin)
+        with semaphores():
+            pool = ProcessPoolExecutor(count, context, initializer=with_plugins, initargs=begin)
         try:
             yield pool
         except BaseException:
@@ -167,6 +178,22 @@ def worker_pool(
             raise
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def semaphores() -> Iterator[None]:
+    """Say what to do where the system has no POSIX semaphores, which processes need to share.
+
+    Raises:
+        NumericalError: it has none, or no place for them.
+    """
+    try:
+        yield
+    except (OSError, ImportError, NotImplementedError) as error:
+        raise NumericalError(
+            f"no worker processes: this system gives no semaphores ({error})",
+            hint="run it with --workers 0; results are the same",
+        ) from None
 
 
 def with_plugins(
@@ -204,7 +231,7 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with spawning():
         if where == LOCAL:
-            with signals_blocked():
+            with signals_blocked(), semaphores():
                 local = dask.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
@@ -213,10 +240,12 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
                 )
             target: dict[str, Any] = {"address": local}
         else:
-            target = {"scheduler_file": where} if Path(where).is_file() else {"address": where}
+            target = {"address": scheduler_address(where)}
         try:
+            if where != LOCAL:
+                check_answer(target["address"])
             client = dask.Client(**target, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError, AssertionError) as error:
             raise UsageError(
                 f"--cluster {where}: no Dask scheduler answers ({error or 'timeout'})",
                 hint=f"hjepa ... --cluster {LOCAL}, or start one: dask scheduler",
@@ -240,6 +269,55 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
             if where == LOCAL:
                 with suppress(TimeoutError):  # the work is done; they end with us
                     target["address"].close()
+
+
+def scheduler_address(where: str) -> str:
+    """Return the address of a scheduler, from its JSON file where ``where`` is one.
+
+    Raises:
+        UsageError: the file is none that a scheduler writes.
+    """
+    if not Path(where).exists():
+        return where
+    try:
+        found = json.loads(plugins.read_regular(Path(where)))
+        address = found["address"]
+        if not isinstance(address, str):
+            raise TypeError("its address is no text")
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        raise UsageError(
+            f"--cluster {where}: not the file of a Dask scheduler: {error or type(error).__name__}",
+            hint=f"dask scheduler --scheduler-file {where} writes one",
+        ) from None
+    return address
+
+
+def check_answer(address: str) -> None:
+    """Raise OSError unless who listens there begins as Dask does: it waits for others for good."""
+    scheme, sign, place = address.rpartition("://")
+    host, _, port = place.rpartition(":")
+    if (sign and scheme != "tcp") or not port.isdecimal():
+        return  # Dask says what is wrong with it
+    with ThreadPoolExecutor(1) as beside:  # here a loop of the caller's may run, as in a notebook
+        begun = beside.submit(asyncio.run, _greeting(host.strip("[]"), int(port))).result()
+    if begun is not None and not 0 < int.from_bytes(begun, "little") < LONGEST_GREETING:
+        raise OSError("what listens there is something else")
+
+
+async def _greeting(host: str, port: int) -> bytes | None:
+    """Return the first 8 bytes that are said there, empty without; ``None`` where nobody is."""
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            heard, there = await asyncio.open_connection(host, port)
+    except (OSError, TimeoutError):
+        return None  # Dask says so
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            return await heard.readexactly(8)
+    except (OSError, TimeoutError, asyncio.IncompleteReadError):
+        return b""
+    finally:
+        there.close()
 
 
 def check_cluster(client: Any, where: str) -> None:

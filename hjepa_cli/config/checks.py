@@ -20,9 +20,9 @@ from hjepa_cli.config.schema import (
     declared,
     flag_of,
 )
-from hjepa_cli.config.settings import PRESETS, load_settings, validated
-from hjepa_cli.errors import UsageError
-from hjepa_cli.plugins import CODECS, LAWS, METHODS, PLANTS, SCHEDULERS
+from hjepa_cli.config.settings import PRESETS, load_settings, locate, validated
+from hjepa_cli.errors import UsageError, meant
+from hjepa_cli.plugins import CODECS, LAWS, METHODS, PLANTS, SCHEDULERS, Registry
 
 LATE = "+"  # between a method and the steps that its packets are late
 
@@ -52,7 +52,11 @@ def resolve(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -
             f"not of '{plant}'",
             hint=other if plant in PRESETS else own,
         )
-    check_settings(settings)
+    try:
+        check_settings(settings)
+    except UsageError as error:
+        locate(error, preset, config, flags)
+        raise
     return settings
 
 
@@ -61,18 +65,19 @@ def check_settings(settings: Settings) -> None:
 
     Settings that were made or changed in Python have not met any of the rules before.
     """
-    validated(dataclasses.asdict(settings))
+    settings = validated(dataclasses.asdict(settings))
     check_strides(settings.hierarchy.h, settings.hierarchy.m, settings.hierarchy.l)
     _check_encoder(settings.encoder)
     check_methods(settings.methods)
     gaps = settings.protocol.gaps
     if not gaps or gaps[0] != 1 or list(gaps) != sorted(set(gaps)):
-        raise UsageError(f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on")
+        raise UsageError(
+            f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on",
+            key="protocol.gaps",
+        )
     check_payload(settings.protocol.payload)
-    if not settings.radio.schedulers:
-        raise UsageError(f"no scheduler given; choose from {', '.join(SCHEDULERS)}")
-    for scheduler in settings.radio.schedulers:
-        SCHEDULERS[scheduler]
+    _check_link(settings.protocol)
+    _check_names(SCHEDULERS, settings.radio.schedulers, "radio.schedulers")
     if settings.conditions.pole_length != 1:
         PLANTS[settings.plant].with_pole_length(settings.conditions.pole_length)
 
@@ -80,26 +85,33 @@ def check_settings(settings: Settings) -> None:
 def check_strides(h: int, m: int, l: int) -> None:
     """Raise UsageError, naming strides that would do, unless m divides h, and l divides m."""
     if not 1 <= h <= LARGEST_STRIDE:
-        raise UsageError(f"--h {h}; expected 1 to {LARGEST_STRIDE}")
+        raise UsageError(f"--h {h}; expected 1 to {LARGEST_STRIDE}", key="hierarchy.h")
     fitting_m = _largest_divisor(h, m)
     fitting_l = _largest_divisor(fitting_m, l)
     hint = f"hjepa train-hierarchy --h {h} --m {fitting_m} --l {fitting_l}"
     for name, value, outer_name, outer in (("m", m, "h", h), ("l", l, "m", m)):
         if value < 1 or outer % value:
-            choices = ", ".join(str(divisor) for divisor in _divisors(outer))
+            fitting = ", ".join(str(divisor) for divisor in _divisors(outer))
             raise UsageError(
                 f"--{name} {value} does not divide --{outer_name} {outer}; "
-                f"choose --{name} from {choices}",
+                f"choose --{name} from {fitting}",
                 hint=hint,
+                key=f"hierarchy.{name}",
             )
 
 
 def check_methods(methods: tuple[str, ...]) -> None:
     """Raise UsageError for no name, or one that no method has (of ``ts-jepa-N``, any N has)."""
-    if not methods:
-        raise UsageError(f"no method given; choose from {', '.join(METHODS)}")
-    for method in methods:
-        METHODS[method]
+    _check_names(METHODS, methods, "methods")
+
+
+def _check_names(registry: Registry, names: tuple[str, ...], key: str) -> None:
+    if not names:
+        kind = registry.kind
+        raise UsageError(f"no {kind} given; choose from {', '.join(registry)}", key=key)
+    for name in names:
+        if name not in registry:
+            raise registry.unknown(name, key)
 
 
 def needs_model(method: str) -> bool:
@@ -123,7 +135,9 @@ def check_payload(name: str) -> None:
     if name not in CODECS:
         described = [getattr(codec, "described", codec.name) for codec in CODECS.values()]
         raise UsageError(
-            f"unknown payload '{name}'; choose {', '.join(described[:-1])}, or {described[-1]}"
+            f"unknown payload '{name}'; {meant(name, CODECS)}choose {', '.join(described[:-1])}, "
+            f"or {described[-1]}",
+            key="protocol.payload",
         )
 
 
@@ -135,6 +149,7 @@ def check_warmup(protocol: ProtocolSettings) -> None:
             f"{protocol.warmup_steps}; expected at least as many as the warm-up has",
             hint=f"--protocol paper, or steps = {protocol.warmup_steps} or more in "
             "--config FILE.toml",
+            key="protocol.steps",
         )
 
 
@@ -146,6 +161,19 @@ def check_gaps(protocol: ProtocolSettings) -> None:
             f"protocol.gaps end with {longest} steps, and protocol.steps = {protocol.steps} are "
             "scored; expected gaps no longer than that",
             hint=f"steps = {longest} or more, or shorter gaps, in --config FILE.toml",
+            key="protocol.gaps",
+        )
+
+
+def _check_link(protocol: ProtocolSettings) -> None:
+    """Raise UsageError where the first packet may arrive when all is over."""
+    latest = protocol.delay_steps + protocol.jitter_steps
+    if latest >= protocol.total_steps:
+        raise UsageError(
+            f"packets may come {latest} steps late, and there are {protocol.total_steps} steps; "
+            "nobody would be heard",
+            hint="less --delay-steps and --jitter-steps, or more steps in --config FILE.toml",
+            key="protocol.delay_steps" if protocol.delay_steps else "protocol.jitter_steps",
         )
 
 
@@ -162,23 +190,27 @@ def check_cell(radio: RadioSettings, given: Mapping[str, object] = MappingProxyT
         named = f"{key} = {unlike.get(key)!r}"
         if key in flags:
             named = flag.name if flag else f"--{key}"
+        where = None if key in flags else key
         laws = [law for law in LAWS if key in LAWS[law].uses]
         if laws and radio.law not in laws:
             raise UsageError(
                 f"{named} is for the law {' or '.join(laws)}, this is {radio.law}",
                 hint=f"hjepa scale --law {laws[0]} …, or leave out {named}",
+                key=where,
             )
         topology = TOPOLOGIES.get(key, radio.topology)
         if topology != radio.topology:
             raise UsageError(
                 f"{named} is for the topology {topology}, this is {radio.topology}",
                 hint=f"hjepa scale --law scheduled --topology {topology} …, or leave out {named}",
+                key=where,
             )
     if radio.harq_rounds > 1 and radio.block_error == 0:
         raise UsageError(
             f"radio.harq_rounds = {radio.harq_rounds} is for a radio.block_error above 0; without "
             "one no packet is repeated",
             hint="set block_error in --config FILE.toml, or leave out harq_rounds",
+            key="radio.harq_rounds",
         )
 
 
@@ -208,16 +240,22 @@ def check_schedulable(methods: Sequence[str], steps: int) -> None:
         raise UsageError(
             f"law scheduled fits packets into slots; {', '.join(raw)} needs several slots for one",
             hint="choose --law duty for it, or other --methods",
+            key="methods",
         )
     for name, method in described.items():
         if not method.needs_link:
-            raise UsageError(f"'{name}' has no link to share; choose a method that has one")
+            raise UsageError(
+                f"'{name}' has no link to share; choose a method that has one", key="methods"
+            )
         if split_late(name)[1]:
-            raise UsageError(f"'{name}': under law scheduled packets arrive in the slot they get")
+            raise UsageError(
+                f"'{name}': under law scheduled packets arrive in the slot they get", key="methods"
+            )
     if steps < 2:
         raise UsageError(
             f"protocol.steps = {steps}; law scheduled needs at least 2, as in the first slot "
-            "everybody is heard"
+            "everybody is heard",
+            key="protocol.steps",
         )
 
 
@@ -242,12 +280,16 @@ def split_late(name: str) -> tuple[str, int]:
 
 def _check_encoder(encoder: EncoderSettings) -> None:
     if encoder.frames not in FRAMES[encoder.method]:
-        choices = " or ".join(map(str, FRAMES[encoder.method]))
-        raise UsageError(f"--frames {encoder.frames}: method {encoder.method} takes {choices}")
+        fitting = " or ".join(map(str, FRAMES[encoder.method]))
+        raise UsageError(
+            f"--frames {encoder.frames}; method {encoder.method} takes {fitting}",
+            key="encoder.frames",
+        )
     if encoder.mirror == "exact" and encoder.embedding % 2:
         raise UsageError(
             f"encoder.embedding = {encoder.embedding}; expected an even number, for a half that a "
-            'mirror keeps and one that it negates, or mirror = "augment" or "none"'
+            'mirror keeps and one that it negates, or mirror = "augment" or "none"',
+            key="encoder.embedding",
         )
 
 

@@ -19,13 +19,19 @@ LARGEST = sys.float_info.max  # bounds what is not bounded otherwise: no infinit
 LARGEST_SEED = 2**63 - 1
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 
-Count = Annotated[int, Meta(ge=1)]
-CountFromTwo = Annotated[int, Meta(ge=2)]  # nothing is learned without a next one
-CountOrNone = Annotated[int, Meta(ge=0)]
+MOST = 10**9  # of anything: beyond what any machine holds or any program counts
+WIDEST = 2**16  # values of an embedding or a layer
+
+Count = Annotated[int, Meta(ge=1, le=MOST)]
+CountFromTwo = Annotated[int, Meta(ge=2, le=MOST)]  # nothing is learned without a next one
+CountOrNone = Annotated[int, Meta(ge=0, le=MOST)]
+Width = Annotated[int, Meta(ge=1, le=WIDEST)]
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
+GreyLevels = Annotated[float, Meta(ge=0, le=255)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Candidates = Annotated[int, Meta(ge=4, le=10_000)]  # of a round of CMA-ES
 Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
 
 
@@ -92,8 +98,8 @@ class EncoderSettings:
         Count,
         Flag("--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
     ] = 2
-    embedding: Count = 256
-    hidden: Count = 1024
+    embedding: Width = 256
+    hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
     frame_input: Literal["difference", "pair"] = "difference"
     stride_actions: Literal["all", "held"] = "all"
@@ -116,7 +122,7 @@ class EncoderSettings:
     mirror: Literal["exact", "augment", "none"] = "exact"
     shift_px: CountOrNone = 8  # sideways; no further than every cart stays in the picture
     light_spread: BelowOne = 0.0  # training pictures: each trajectory in a light of 1 ± this
-    camera_noise: NotNegative = 0.0  # and with noise of up to this standard deviation, of 255
+    camera_noise: GreyLevels = 0.0  # and with noise of up to this standard deviation, of 255
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     gate: Annotated[
         bool,
@@ -145,7 +151,7 @@ class EncoderSettings:
 class ActorSettings:
     """Both training stages fit the semantic actor."""
 
-    hidden: Count = 1024
+    hidden: Width = 1024
     dropout: BelowOne = 0.2
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     learning_rate: NotNegative = 1e-3
@@ -197,11 +203,28 @@ class ReflexSettings:
     gradient_clip: NotNegative = 1.0
     search_devices: Count = 32  # on the true state, of gains and decay together
     search_steps: Count = 1000
-    search_candidates: Count = 48
+    search_candidates: Candidates = 48
     search_rounds: Count = 10
     fit_devices: Count = 24  # on embeddings, of a factor and the decay
-    fit_candidates: Count = 12
+    fit_candidates: Candidates = 12
     fit_rounds: Count = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class FusionSettings:
+    """``train-fusion`` learns what to make of packets that are not quite right.
+
+    They are those of devices in the settings' [conditions], quantised as [protocol] says.
+    """
+
+    rounds: Count = 12  # of loops, then training on them
+    devices: Count = 32  # in the conditions, and as many in none
+    loop_steps: Count = 700
+    steps: Count = 300  # of training in a round
+    batch: Count = 256
+    learning_rate: NotNegative = 1e-3
+    weight_decay: NotNegative = 1e-2
+    gradient_clip: NotNegative = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,6 +293,11 @@ class ProtocolSettings:
         return self.warmup_steps + self.steps
 
     @property
+    def ideal_link(self) -> bool:
+        """Return whether packets come at once and every force arrives, as in the paper."""
+        return not any(getattr(self, key) for key in IDEAL_LINK)
+
+    @property
     def velocity_noise(self) -> tuple[float, ...]:
         """Return the standard deviation of what disturbs a step, one per state."""
         return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
@@ -285,17 +313,27 @@ PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
 class ControlSettings:
     """``collect`` and all after it: the law that models learn and that their rivals play.
 
-    Without one it is the plant's own teacher. :mod:`hjepa_cli.core.plants.control_law` says what
-    the numbers are, force by force; ``hjepa tune-law`` finds them.
+    Without gains it is the plant's own teacher. The law is u = −K x; K is given row by row, one
+    row per force. ``hjepa tune-law`` finds both.
     """
 
-    slow_gains: tuple[Number, ...] = ()
-    fast_gains: tuple[Number, ...] = ()
-    cap_n: tuple[NotNegative, ...] = ()
-    # Of method ``ceiling``, which no actor has to learn.
-    ceiling_slow_gains: tuple[Number, ...] = ()
-    ceiling_fast_gains: tuple[Number, ...] = ()
-    ceiling_cap_n: tuple[NotNegative, ...] = ()
+    gains_n: tuple[Number, ...] = ()  # N per unit of state
+    ceiling_gains_n: tuple[Number, ...] = ()  # of method ceiling, which no actor has to learn
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneSettings:
+    """``tune-law`` searches both laws on the true state.
+
+    Errors are standard deviations in units of those that states have under the teacher.
+    """
+
+    devices: Count = 24
+    steps: Count = 2000  # scored, after the protocol's warm-up
+    candidates: Candidates = 12
+    rounds: Count = 24
+    packet_error: NotNegative = 0.05  # of the state that a packet tells
+    actor_error: NotNegative = 0.2  # of the state that the law sees, anew at every step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,9 +343,9 @@ class ConditionSettings:
     Beside ``protocol.plant_spread``; controllers do not know.
     """
 
-    light: Positive = 1.0  # factor on what the camera sees
-    camera_noise: NotNegative = 0.0  # standard deviation in every pixel, of 255
-    pole_length: Positive = 1.0  # ÷ the nominal one
+    light: Annotated[float, Meta(gt=0, le=255)] = 1.0  # factor on what the camera sees
+    camera_noise: GreyLevels = 0.0  # standard deviation in every pixel, of 255
+    pole_length: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # ÷ the nominal one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -422,6 +460,8 @@ class Settings:
         *("hold", "optimal", "oracle"),
     )
     control: ControlSettings = ControlSettings()
+    tune: TuneSettings = TuneSettings()
+    fusion: FusionSettings = FusionSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
     actor: ActorSettings = ActorSettings()
@@ -437,13 +477,13 @@ class Settings:
         Empty lists and the zeros of an ideal link are left out: they stand for values that say the
         same, and digests of settings stay what they were before there were such settings.
         """
-        plain = typing.cast(dict[str, Any], _plain(dataclasses.asdict(self)))
+        values = _without_empty(plain(dataclasses.asdict(self)))
         for key in IDEAL_LINK:
-            if not plain["protocol"][key]:
-                del plain["protocol"][key]
-        if not plain["control"]:
-            del plain["control"]
-        return plain
+            if not values["protocol"][key]:
+                del values["protocol"][key]
+        if not values["control"]:
+            del values["control"]
+        return values
 
 
 @functools.cache
@@ -511,9 +551,18 @@ def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
     return flat
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items() if entry != ()}
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
-    return value
+def plain(value: Any) -> Any:
+    """Return nested values with lists for tuples, and Python's numbers for those of numpy."""
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return [plain(entry) for entry in value] if isinstance(value, tuple | list) else value
+
+
+def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_empty(entry) if isinstance(entry, dict) else entry
+        for key, entry in values.items()
+        if entry != []
+    }

@@ -11,19 +11,28 @@ import operator
 import re
 import tomllib
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from hjepa_cli.config.schema import PAPER_PROTOCOL, Settings, bare, declared, dotted, must_be
-from hjepa_cli.errors import DataError, MissingInputError, UsageError
-from hjepa_cli.plugins import LAWS, PLANTS
+from hjepa_cli.config.schema import (
+    PAPER_PROTOCOL,
+    Settings,
+    bare,
+    choices_of,
+    declared,
+    dotted,
+    must_be,
+    plain,
+)
+from hjepa_cli.errors import DataError, MissingInputError, UsageError, choices
+from hjepa_cli.plugins import LAWS, PLANTS, read_regular
 
-CONFIG_LIMIT_BYTES = 2**20
 _FOLDER = resources.files("hjepa_cli.config") / "presets"
+_CONTROL_LAWS = resources.files("hjepa_cli.config") / "control_laws.toml"
 PRESETS = ("default", *sorted(Path(entry.name).stem for entry in _FOLDER.iterdir()))
 PROTOCOLS = ("steady", "paper")  # scored after a warm-up, or from the start on as in the paper
 
@@ -45,9 +54,11 @@ class Layer:
 
 
 def load_settings(
-    preset: str | None = None, config: Path | None = None, flags: Mapping[str, Any] | None = None
+    preset: str | None = None,
+    config: str | Path | None = None,
+    flags: Mapping[str, Any] | None = None,
 ) -> Settings:
-    """Merge default < preset < config file < flags.
+    """Merge default < control law of the plant < preset < config file < flags.
 
     A plant has its own ranges and noise, so ``plant`` in flags or file alone means its preset.
 
@@ -68,19 +79,26 @@ def load_settings(
     for layer in layers:
         _merge(values, layer.values, layer)
 
-    def place(key: str) -> str:
-        return next(one for one in reversed(layers) if key in dotted(one.values)).place(key)
+    try:
+        return validated(values | {"preset": name})
+    except UsageError as error:
+        error.locate(functools.partial(_place, layers))
+        raise
 
-    settings = validated(values | {"preset": name}, place)
-    for key, names in (("plant", PLANTS), ("radio.law", LAWS)):
-        if (value := operator.attrgetter(key)(settings)) not in names:
-            choices = ", ".join(names)
-            raise UsageError(f"{key} = {value!r}{place(key)}; choose one of {choices}")
-    return settings
+
+def locate(
+    error: UsageError, preset: str | None, config: str | Path | None, flags: Mapping[str, Any]
+) -> None:
+    """Name the file and the line, in an error about a setting that is none of a flag or preset."""
+    if error.key is not None:
+        _, layers = _layers(preset, config, flags)
+        error.locate(functools.partial(_place, layers))
 
 
 def origins(
-    preset: str | None = None, config: Path | None = None, flags: Mapping[str, Any] | None = None
+    preset: str | None = None,
+    config: str | Path | None = None,
+    flags: Mapping[str, Any] | None = None,
 ) -> dict[str, str]:
     """Return where each value of :func:`load_settings` comes from, by dotted key.
 
@@ -91,37 +109,57 @@ def origins(
     return {key: layer.source for layer in layers for key in dotted(layer.values)}
 
 
-def validated(values: Mapping[str, Any], place: Callable[[str], str] = lambda key: "") -> Settings:
+def validated(values: Mapping[str, Any]) -> Settings:
     """Make settings of nested values, each of the type and within the bounds of its declaration.
 
-    Raise UsageError naming the key, its value, its ``place``, and what it must be.
+    Raise UsageError with the key, its value, and what it must be.
     """
+    values = {key: plain(value) for key, value in values.items()}
     try:
-        return msgspec.convert(values, Settings)
+        settings = msgspec.convert(values, Settings)
     except msgspec.ValidationError as error:
         path = str(error).rpartition("`$.")[2].rstrip("`")  # as protocol.gaps[1]
+    else:
+        for key, names in (("plant", PLANTS), ("radio.law", LAWS)):
+            if (value := operator.attrgetter(key)(settings)) not in names:
+                known = choices(value, names, "choose one of")
+                raise UsageError(f"{key} = {value!r}; {known}", key=key)
+        return settings
     key, _, index = path.rstrip("]").partition("[")
-    hint, value = declared()[key], functools.reduce(operator.getitem, key.split("."), values)
+    hint, value = declared().get(key), functools.reduce(operator.getitem, key.split("."), values)
+    if hint is None:
+        raise UsageError(f"{key} = {value!r}; expected a section")
     if index:
         hint, value = typing.get_args(bare(hint))[0], value[int(index)]
-    wanted = must_be(hint)
-    verb = "choose" if wanted.startswith("one of") else "expected"
-    raise UsageError(f"{path} = {value!r}{place(key)}; {verb} {wanted}")
+    words = choices_of(hint)
+    wanted = choices(value, words, "choose one of") if words else f"expected {must_be(hint)}"
+    raise UsageError(f"{path} = {value!r}; {wanted}", key=key)
+
+
+def _place(layers: list[Layer], key: str) -> str:
+    """Return where the layer that counts sets a key, for a message."""
+    found = (layer for layer in reversed(layers) if key in dotted(layer.values))
+    return next((layer.place(key) for layer in found), "")
 
 
 def _layers(
-    preset: str | None, config: Path | None, flags: Mapping[str, Any]
+    preset: str | None, config: str | Path | None, flags: Mapping[str, Any]
 ) -> tuple[str, list[Layer]]:
     """Return the preset's name and what defines the settings, weakest first."""
-    file = [] if config is None else [_read_config(config)]
+    for key in flags:
+        if not isinstance(key, str):
+            raise UsageError(f"unknown setting {key!r}; expected a dotted key as 'protocol.steps'")
+    file = [] if config is None else [_read_config(Path(config))]
     if preset is None:  # that of the plant
         plant = flags.get("plant") or next((one.values.get("plant") for one in file), None)
         preset = plant if plant in PRESETS else "default"
     if preset not in PRESETS:
-        raise UsageError(f"unknown preset '{preset}'; choose one of {', '.join(PRESETS)}")
+        raise UsageError(f"unknown preset '{preset}'; {choices(preset, PRESETS, 'choose one of')}")
     protocol = flags.get("protocol") or PROTOCOLS[0]
     if protocol not in PROTOCOLS:
-        raise UsageError(f"unknown protocol {protocol!r}; choose one of {', '.join(PROTOCOLS)}")
+        raise UsageError(
+            f"unknown protocol {protocol!r}; {choices(protocol, PROTOCOLS, 'choose one of')}"
+        )
     defaults = dataclasses.asdict(Settings())
     del defaults["preset"]
     layers, paper = [Layer("default", defaults)], [PAPER_PROTOCOL]
@@ -129,21 +167,30 @@ def _layers(
         values = tomllib.loads((_FOLDER / f"{preset}.toml").read_text(encoding="utf-8"))
         paper.append(values.get("protocol", {}).pop("paper", {}))
         layers.append(Layer(f"preset {preset}", values))
+    plants = [flags.get("plant"), *(one.values.get("plant") for one in reversed([*layers, *file]))]
+    plant = next(one for one in plants if one is not None)
+    if law := _control_laws().get(plant):
+        layers.insert(1, Layer(f"tuned law of {plant}", {"control": law}))
     if protocol == "paper":
         layers += [Layer("protocol paper", {"protocol": values}) for values in paper]
     layers += file
     for key, value in flags.items():
         if value is not None and key != "protocol":
-            section, _, field = key.rpartition(".")
-            layers.append(Layer("flag", {section: {field: value}} if section else {key: value}))
+            for name in reversed(key.split(".")):
+                value = {name: value}
+            layers.append(Layer("flag", value))
     return preset, layers
+
+
+@functools.cache
+def _control_laws() -> dict[str, Any]:
+    """Return the section [control] of each plant that has one, as ``tune-law`` found it."""
+    return tomllib.loads(_CONTROL_LAWS.read_text(encoding="utf-8"))
 
 
 def _read_config(path: Path) -> Layer:
     try:
-        if path.stat().st_size > CONFIG_LIMIT_BYTES:
-            raise DataError(f"config file {path} is larger than {CONFIG_LIMIT_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path)
         return Layer(str(path), tomllib.loads(text), text)
     except FileNotFoundError:
         raise MissingInputError(f"config file {path} does not exist") from None

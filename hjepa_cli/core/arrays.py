@@ -1,9 +1,11 @@
-"""These arrays pass between the rooms of the core, and only finite ones enter."""
+"""These arrays pass between the rooms of the core, and only fitting, finite ones enter."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hjepa_cli.errors import NumericalError
+from hjepa_cli.errors import ArrayError, NumericalError
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -16,11 +18,36 @@ def finite(values: ArrayLike, name: str) -> Floats:
 
     Raises:
         NumericalError: one is NaN or infinite; the message says which.
+        ArrayError: they are no real numbers.
     """
-    array = np.asarray(values, float)
+    array = _numbers(values, name)
     if not np.isfinite(array).all():
         first = np.argwhere(~np.isfinite(array))[0].tolist()
         raise NumericalError(
             f"{name}{first or ''} is {array[tuple(first)]}; expected finite numbers"
         )
     return array
+
+
+def described(values: Any) -> str:
+    """Say what an array or tensor is: ``float32 [2, 64, 128] from 0 to 0.97``."""
+    shape = ", ".join(map(str, values.shape))
+    text = f"{str(values.dtype).removeprefix('torch.')} [{shape}]"
+    if 0 in values.shape or getattr(values.dtype, "kind", "f") not in "biuf" or "complex" in text:
+        return text
+    return f"{text} from {float(values.min()):.6g} to {float(values.max()):.6g}"
+
+
+def array_from(values: ArrayLike, name: str) -> NDArray[Any]:
+    """Return anything as an array; raise ArrayError for what is none, as lists of many lengths."""
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ArrayError(f"{name} is no array: {error}") from None
+
+
+def _numbers(values: ArrayLike, name: str) -> Floats:
+    array = array_from(values, name)
+    if array.dtype.kind not in "biuf":
+        raise ArrayError(f"{name}: {described(array)}; expected real numbers")
+    return np.asarray(array, np.float64)

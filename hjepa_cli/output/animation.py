@@ -23,11 +23,12 @@ from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.pictures import FAINT, INK, PAPER, font
 from hjepa_cli.storage import files
 
-FORMATS = (".gif", ".mp4")
+MOST_PX = {".gif": 2**16 - 1, ".mp4": 2**14}  # each way: of the format, of the encoder
+FORMATS = tuple(MOST_PX)
 SCALE = 2  # a frame's pixel is so many of the picture
 PANEL_PX = (WIDTH_PX * SCALE, HEIGHT_PX * SCALE + 16 + 14)  # text above, strip below
 MARGIN_PX, TITLE_PX, HEADER_PX = 8, 20, 34
-LEAST_WIDTH_PX = 600  # for the legend
+LEAST_WIDTH_PX = 600  # for the notes at the top
 TEXT, NAME = font(12), font(14)  # below 12 px, Pillow's letters swallow the blanks
 ARRIVED, LOST = (0, 158, 115), (213, 94, 0)  # safe for colour-blind readers
 DASH_PX = 7
@@ -52,9 +53,9 @@ class Pictures:
         self.steps = list(range(0, len(link.delivered), every))
         self._camera = camera
         self.devices = link.delivered.shape[1]
-        width = max(self.devices * (PANEL_PX[0] + MARGIN_PX) + MARGIN_PX, LEAST_WIDTH_PX)
-        height = len(films) * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX
-        self.size_px = (width + width % 2, height + height % 2)  # MP4 wants even sizes
+        self._legend = "dashed: what the controller believes; bar: packet arrived"
+        self._legend += "; tick: lost" * link.sends_always + link.late.replace(",", ";", 1)
+        self.size_px = size_px(self.devices, len(films), self._legend)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -68,9 +69,7 @@ class Pictures:
         draw = ImageDraw.Draw(picture)
         clock = f"t = {1e3 * k * self.kind.step_s:.0f} ms   {self.link.label}"
         draw.text((MARGIN_PX, 3), clock, FAINT, TEXT)
-        legend = "dashed: what the controller believes; bar: packet arrived"
-        legend += "; tick: lost" if self.link.sends_always else ""
-        draw.text((MARGIN_PX, 19), legend, FAINT, TEXT)
+        draw.text((MARGIN_PX, 19), self._legend, FAINT, TEXT)
         for row, shot in enumerate(self.films):
             top = HEADER_PX + MARGIN_PX + row * (PANEL_PX[1] + TITLE_PX + MARGIN_PX)
             score = shot.score[: k + 1].mean()
@@ -82,18 +81,15 @@ class Pictures:
                 picture.paste(self._panel(shot, device, k), (left, top + TITLE_PX))
         return picture
 
-    def age_steps(self, device: int, k: int) -> int:
-        """Return steps since the last packet of a device arrived; 0 where one arrives at ``k``."""
-        return k - int(np.flatnonzero(self.link.delivered[: k + 1, device])[-1])
-
     def frame(self, shot: Film, device: int, k: int) -> Pixels:
         """Return what the camera sees, uint8 [64, 128, 3]."""
         (frame,) = self._camera.render(shot.states[k, device][None])
         return frame
 
-    def age_ms(self, device: int, k: int) -> float:
-        """Return the time since the last packet of a device arrived, in milliseconds."""
-        return 1e3 * self.age_steps(device, k) * self.kind.step_s
+    def age(self, device: int, k: int) -> str:
+        """Say how long ago the newest packet was sent that the controller has of a device."""
+        steps = self.link.age_steps[k, device]
+        return "no packet" if steps < 0 else f"packet {1e3 * steps * self.kind.step_s:.0f} ms old"
 
     def sketch(self, shot: Film, device: int, k: int) -> list[Floats]:
         """Return the believed state as lines over a frame, in its pixels."""
@@ -111,8 +107,8 @@ class Pictures:
     def _panel(self, shot: Film, device: int, k: int) -> Image.Image:
         panel = Image.new("RGB", PANEL_PX, PAPER)
         draw = ImageDraw.Draw(panel)
-        age_ms, snr_db = self.age_ms(device, k), self.link.snr_db[k, device]
-        caption = f"device {device}   packet {age_ms:.0f} ms old   SNR {snr_db:.0f} dB"
+        age, snr_db = self.age(device, k), self.link.snr_db[k, device]
+        caption = f"device {device}   {age}   SNR {snr_db:.0f} dB"
         draw.text((0, 0), caption, INK, TEXT)
         scene = Image.fromarray(self.frame(shot, device, k))
         scene = scene.resize((WIDTH_PX * SCALE, HEIGHT_PX * SCALE), Image.Resampling.BOX)
@@ -147,10 +143,26 @@ class Pictures:
                 draw.line([(column, bottom - 2), (column, bottom)], fill=LOST)
 
 
-def check_target(path: Path, fps: int) -> None:
+def size_px(devices: int, methods: int, legend: str = "") -> tuple[int, int]:
+    """Return width and height of a picture: even numbers, as MP4 wants."""
+    panels, words = devices * (PANEL_PX[0] + MARGIN_PX), int(TEXT.getlength(legend)) + MARGIN_PX
+    width = max(panels + MARGIN_PX, LEAST_WIDTH_PX, words + MARGIN_PX)
+    height = methods * (PANEL_PX[1] + TITLE_PX + MARGIN_PX) + MARGIN_PX + HEADER_PX
+    return width + width % 2, height + height % 2
+
+
+def check_target(path: Path, fps: int, devices: int, methods: int) -> None:
     """Raise UsageError or MissingInputError for a file that we could not write, in good time."""
     if path.suffix not in FORMATS:
         raise UsageError(f"no animation format '{path.suffix}'; --out FILE.gif or FILE.mp4")
+    most = MOST_PX[path.suffix]
+    for what, count, across in (("devices", devices, 0), ("methods", methods, 1)):
+        if size_px(devices, methods)[across] > most:
+            fitting = max(n for n in range(count) if size_px(n, n)[across] <= most)
+            raise UsageError(
+                f"{count} {what}: a {path.suffix[1:].upper()} has room for {fitting}",
+                hint=f"--{what} with at most {fitting}; eval measures any number",
+            )
     if path.suffix == ".gif" and fps > MOST_GIF_FPS:
         raise UsageError(
             f"--fps {fps}: a GIF holds at most {MOST_GIF_FPS} pictures per second",

@@ -4,14 +4,28 @@ This is the only module that imports matplotlib (extra ``plot``). Figures are bu
 so no display, backend or global state is involved.
 """
 
+# ruff: noqa: E402 (matplotlib is imported with care)
+import contextlib
 import io
 import itertools
+import os
 from collections.abc import Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+
+# matplotlib cannot be imported where MPLBACKEND names the backend of a notebook that is not
+# installed here. None is used for files; whoever shows figures in this process still gets theirs.
+_wanted = os.environ.pop("MPLBACKEND", None)
+try:
+    import matplotlib
+finally:
+    if _wanted is not None:
+        os.environ["MPLBACKEND"] = _wanted
+if _wanted is not None:
+    with contextlib.suppress(ValueError):
+        matplotlib.rcParams["backend"] = _wanted
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure, SubFigure

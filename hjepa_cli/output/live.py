@@ -35,7 +35,7 @@ def terminal_picture(pictures: Pictures, k: int, width: int, height: int) -> Gro
     columns = panel_columns(pictures, width, height)
     nothing = "none did" if pictures.link.sends_always else "none sent"
     parts: list[Text | Table] = [
-        Text(pictures.link.label, style="dim", no_wrap=True),
+        Text(pictures.link.label + pictures.link.late, style="dim", no_wrap=True),
         Text(f"black: what the controller believes; █ packet arrived, · {nothing}", style="dim",
              no_wrap=True),
     ]  # fmt: skip
@@ -73,7 +73,7 @@ def _captions(pictures: Pictures, shot: Film, device: int, k: int, columns: int)
         else:
             text.append("·", style="red" if pictures.link.sends_always else "dim")
     snr_db = pictures.link.snr_db[k, device]
-    text.append(f"\n{pictures.age_ms(device, k):.0f} ms old, {snr_db:.0f} dB")
+    text.append(f"\n{pictures.age(device, k).removeprefix('packet ')}, {snr_db:.0f} dB")
     text.append(f"\n{pictures.error(shot, device, k)}", style="dim")
     return text
 

@@ -3,15 +3,21 @@
 from typing import Any
 
 from hjepa_cli.core.control.force_error import WINDOWS
+from hjepa_cli.core.control.link import described
 from hjepa_cli.core.evaluation.protocol import BESIDE
 from hjepa_cli.output.screen import Screen, described_steps, tolerance
+
+
+def measured(value: float | None) -> str:
+    """Set a number with three decimals, or say that there is none."""
+    return "undefined" if value is None else f"{value:.3f}"
 
 
 def show_gates(screen: Screen, gates: dict[str, dict[str, Any]], *, enforced: bool) -> None:
     """Print a row per gate."""
     rows = [
         [
-            *(name, f"{gate['value']:.3f}"),
+            *(name, measured(gate["value"])),
             f"{'≤' if name == 'actor_nrmse' else '≥'} {gate['threshold']:g}",
             "passed" if gate["passed"] else "FAILED",
         ]
@@ -29,7 +35,7 @@ def show_hierarchy(result: dict[str, Any], screen: Screen) -> None:
         f"{result.get('method', 'hjepa')} alone after one packet: NMAE by steps "
         f"({result['n_rollouts']} clean rollouts); actor NRMSE and action sensitivity held out",
         [*windows, "actor NRMSE", "sensitivity"],
-        [[f"{value:.3f}" for value in (*windows.values(), *held_out)]],
+        [[measured(value) for value in (*windows.values(), *held_out)]],
     )
 
 
@@ -50,6 +56,17 @@ def show_reflex(result: dict[str, Any], screen: Screen) -> None:
     )
 
 
+def show_fusion(result: dict[str, Any], screen: Screen) -> None:
+    """Print how far predictions, packets and what is made of both are from the truth."""
+    distances = result["distances"]
+    screen.table(
+        f"distance 1 − cos from clean embeddings, over {result['packets']} packets of loops that "
+        "training did not see",
+        [*distances],
+        [[f"{value:.5f}" for value in distances.values()]],
+    )
+
+
 def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
     """Print the tables of an evaluation: what each method does, and its score over the gap."""
     entries = result["methods"]
@@ -57,7 +74,7 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
         return
     first = next(iter(entries.values()))
     windows = [f"{start}-{end}" for start, end in WINDOWS]
-    where = f"{result['plant']}, seed {result['seed']}"
+    where = f"{result['plant']}, seed {result['seed']}{described(result.get('link', {}))}"
     errors, tolerances, scores = [], [], []
     for name, entry in entries.items():
         nmae = (_number(entry["nmae_windows"].get(window), 3) for window in windows)

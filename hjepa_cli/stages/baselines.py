@@ -109,7 +109,7 @@ def _read(
 @torch.inference_mode()
 def _actor_error(
     networks: nn.ModuleDict, z: torch.Tensor, split: RenderedSplit, *, every: int
-) -> float:
+) -> float | None:
     """Return the NRMSE of the actor on embeddings [N · K, D]."""
     actor = networks["actor"]
     forces = actor.act(z.to(next(actor.parameters()).device)).cpu()  # type: ignore[operator]

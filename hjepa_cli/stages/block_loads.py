@@ -16,6 +16,7 @@ from hjepa_cli.core.evaluation.load_simulator import (
     OneLoad,
     PacketBits,
     Search,
+    hall_coverage,
 )
 from hjepa_cli.core.evaluation.simulator import Tick, silent
 from hjepa_cli.core.evaluation.workers import Workers
@@ -70,7 +71,20 @@ class BlockLoads:
         """Count one method's devices under one scheduler at one SNR."""
         key = self._key(name, scheduler, snr_db)
         found = self._loads[key] if self._fits(name, snr_db) else None
-        return self._band.row(found, name, scheduler, self._bits[name], snr_db)
+        row = self._band.row(found, name, scheduler, self._bits[name], snr_db)
+        if self._settings.radio.topology != "hall":
+            return row
+        row["coverage"] = share = self.coverage(snr_db)
+        if row["devices"] == 0:
+            covered = f"{share:.0%} of the hall's devices reach {snr_db:g} dB"
+            row["reason"] = f"{row['reason']}; {covered}"
+        return row
+
+    def coverage(self, snr_db: float) -> float:
+        """Return the share of a hall's devices, over all seeds, whose power suffices for an SNR."""
+        radio = self._settings.radio
+        shares = [hall_coverage(radio, snr_db, seed, BLOCK_DEVICES) for seed in self._seeds]
+        return sum(shares) / len(shares)
 
     def verify(self, methods: Sequence[str], grid_db: Sequence[float]) -> list[Row]:
         """Simulate a little less and a little more than each load that was found, on its draws.

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.config.checks import check_settings
@@ -34,8 +35,15 @@ from hjepa_cli.core.plants.frames import FRAME_BITS, HEIGHT_PX, WIDTH_PX, frames
 from hjepa_cli.core.plants.named import plant, plant_of
 from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.plugins import PLANTS
 from hjepa_cli.stages.plan import Plan, seconds_of
-from hjepa_cli.storage.files import check_free_space, point_to
+from hjepa_cli.storage.files import (
+    check_free_space,
+    holding,
+    identity,
+    point_to,
+    refuse_foreign,
+)
 from hjepa_cli.storage.runs import continue_command, differences
 from hjepa_cli.storage.shards import (
     LOG,
@@ -110,7 +118,17 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
 
 
 def plan(settings: Settings, *, out: Path | None = None) -> Plan:
-    """Plan the simulation of all splits and, if frames are stored, their pictures."""
+    """Plan the simulation of all splits and, if frames are stored, their pictures.
+
+    It refuses what :func:`run` would refuse, but for a full or read-only disk.
+    """
+    check(settings)
+    plant_of(settings)
+    if out is not None and (out / MANIFEST).exists():
+        load_dataset(out, settings.plant)
+    elif out is not None:
+        refuse_foreign(out, "dataset", lambda name: name == LOG or bool(NAME.fullmatch(name)))
+        check_same(out, settings)
     options, sizes = settings.collect, split_sizes(settings.collect).values()
     steps = sum(count * steps for count, steps in sizes)
     frames = steps + sum(count for count, _ in sizes) if options.frames == "stored" else 0
@@ -128,6 +146,7 @@ def plan(settings: Settings, *, out: Path | None = None) -> Plan:
         writes=[f"dataset {directory} in {len(shards_of(settings))} shards"],
         writes_bytes=size_bytes(settings),
         seconds=2 + seconds_of({"simulated steps": steps, "rendered frames": frames}),
+        memory_bytes=memory_bytes(settings),
     )
 
 
@@ -161,7 +180,8 @@ def telling_how_to_go_on(directory: Path) -> Iterator[None]:
             code=exit_code(error),
         ) from None
     except HjepaError as error:
-        point_to(continue_command(directory), error)
+        if (directory / LOG).exists():  # else nothing is there yet that could be resumed
+            point_to(continue_command(directory), error)
         raise
 
 
@@ -181,6 +201,11 @@ def recorded_settings(directory: Path) -> Settings:
     Raises DataError if the log is damaged, or of a version with other settings.
     """
     task = read_task(directory)
+    if isinstance(name := task.get("plant"), str) and name not in PLANTS:
+        raise UsageError(
+            f"{directory} collects of plant '{name}', which no plugin in force adds",
+            hint=f"{continue_command(directory)} --plugin FILE.py",
+        )
     preset = task.pop("preset", None)
     if preset is not None and not isinstance(preset, str):
         raise DataError(f"{directory} is of preset {preset!r}")
@@ -205,6 +230,7 @@ def check(settings: Settings) -> None:
             f"{total} trajectories; one dataset holds at most {most}",
             hint="collect several, each with its own --seed and --out DIR",
         )
+    memory.check(memory_bytes(settings), "a shard of such trajectories")
 
 
 def shards_of(settings: Settings) -> list[Shard]:
@@ -230,7 +256,7 @@ def make_shards(
     screen.say(
         f"collecting trajectories of plant {settings.plant}: {len(left)} of {len(shards)} shards"
     )
-    make = functools.partial(make_shard, settings, directory)
+    make = functools.partial(make_shard, settings, directory, identity(directory))
     enough = sum(count * steps for count, steps in sizes.values()) >= WORTH_WORKERS
     with (
         screen.progress("collect", total, "trajectories", done=total - to_do) as bar,
@@ -242,14 +268,17 @@ def make_shards(
     return [log.done[shard.name] for shard in shards]
 
 
-def make_shard(settings: Settings, directory: Path, shard: Shard) -> Described:
+def make_shard(
+    settings: Settings, directory: Path, which: tuple[str, int], shard: Shard
+) -> Described:
     """Do a unit of parallel work: decided by its arguments, written atomically, so repeatable."""
     made = generate(settings, shard.split, range(shard.start, shard.stop))
     if settings.collect.frames == "stored":
         made = dataclasses.replace(
             made, frames=frames_of(plant(settings.plant).camera(), made.states, TOGETHER)
         )
-    return write_shard(directory, shard, made, settings.plant)
+    with holding(directory, which):
+        return write_shard(directory, shard, made, settings.plant)
 
 
 def size_bytes(settings: Settings) -> int:
@@ -260,6 +289,19 @@ def size_bytes(settings: Settings) -> int:
     return sum(
         count * ((steps + 1) * (state_bytes + frame_bytes) + force_bytes * steps)
         for count, steps in split_sizes(settings.collect).values()
+    )
+
+
+def memory_bytes(settings: Settings) -> int:
+    """Return what the largest shard takes while it is made: drawn, simulated, as it is written."""
+    collect, kind = settings.collect, plant_of(settings)
+    states, forces = len(kind.state_names), math.prod(kind.action_shape)
+    stored = collect.frames == "stored"
+    row_bytes = 8 * (states + 4 * forces) + 8 * (states + 2 * forces)
+    row_bytes += 2 * HEIGHT_PX * WIDTH_PX * 3 * stored
+    return max(
+        min(count, per_shard(stored)) * (steps + 1) * row_bytes
+        for count, steps in split_sizes(collect).values()
     )
 
 

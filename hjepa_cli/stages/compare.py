@@ -7,7 +7,6 @@ within a training. Runs that do not belong into one picture are refused.
 
 import dataclasses
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,11 @@ from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.statistics import student_interval
-from hjepa_cli.errors import DataError, MissingInputError, require
+from hjepa_cli.errors import DataError, MissingInputError, UsageError, require, shell
 from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.plugins import METHODS
-from hjepa_cli.stages.report import NO_RESULT, SMOKE, found_runs, inputs_of, stage_of
+from hjepa_cli.stages.report import NO_RESULT, found_runs, inputs_of, stage_of
+from hjepa_cli.stages.results import check_config
 from hjepa_cli.storage import runs
 
 AVERAGED = {  # of an entry of ``eval --json``, and where its interval goes
@@ -50,6 +50,7 @@ class Evaluation:
     config: Mapping[str, Any]
     dataset: str | None
     training_seed: int | None
+    grids: Mapping[str, Any]
 
     def seed_of(self, method: str) -> int:
         """Return the training's seed, or of a method without a model the evaluation's."""
@@ -62,7 +63,7 @@ class Evaluation:
         sections = {name: self.config[name] for name in ("protocol", "conditions", "collect")}
         clean = (*curves.CLEAN, "start")
         sections["collect"] = {k: v for k, v in sections["collect"].items() if k in clean}
-        return {key: self.result[key] for key in ALIKE} | dotted(sections)
+        return {key: self.result[key] for key in ALIKE} | dotted(sections) | self.grids
 
     def draws(self) -> dict[str, Any]:
         """Return what must agree within a training besides: methods share their draws there."""
@@ -115,7 +116,7 @@ def run(
     if figures is not None:
         require("matplotlib", "a figure needs matplotlib", "plot")
     found = [open_evaluation(directory, methods) for directory in evaluations(paths)]
-    if any(one.config["preset"] == SMOKE for one in found):
+    if any(one.config["preset"] == runs.SMOKE for one in found):
         screen.say(NO_RESULT)
     check_alike(found)
     by_method, seeds = collected(found, methods)
@@ -154,13 +155,14 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
     Raise DataError for no result of ``eval``, an older one, or models of several trainings.
     """
     result, config = runs.read_result(directory), runs.read_config(directory)
+    check_config("eval", config, directory)
     environment = runs.read_environment(directory)
     if reason := flaw(result, config):
         again = ["hjepa", "eval", "--config", str(directory / runs.CONFIG)]
         again += [*inputs_of(environment), "--out", f"{directory}-again", "--remeasure"]
         raise DataError(
             f"{directory / runs.RESULT}: {reason}",
-            hint=f"leave it out, or in its place: {shlex.join(again)}",
+            hint=f"leave it out, or in its place: {shell(again)}",
         )
     all_of = result["methods"]
     entries = {name: all_of[name] for name in all_of if methods is None or name in methods}
@@ -168,9 +170,10 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
     return Evaluation(
         directory,
         result | {"methods": entries},
-        config | {"preset": environment["preset"]},
+        config | {"preset": environment.get("preset")},
         dataset["sha256"] if isinstance(dataset, dict) else None,
         training_seed(directory, result["training_seeds"], entries),
+        _grids(next(iter(all_of.values()))) if all_of else {},
     )
 
 
@@ -179,9 +182,12 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
     try:
         msgspec.convert(result, _Result)
         msgspec.convert(config, _Config)
+        plant(result["plant"])
+    except UsageError as error:
+        return error.message
     except msgspec.ValidationError as error:
         return f"{error} (an older version?)"
-    steps = len(result["horizon"])
+    steps, first = len(result["horizon"]), next(iter(result["methods"].values()), None)
     for name, entry in result["methods"].items():
         if reason := curves.flaw(entry):
             return f"method '{name}': {reason}"
@@ -189,7 +195,18 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
             return f"method '{name}': no 'nmae_every_step' (an older version?)"
         if not steps == len(entry["nmae"]) == len(entry["nmae_ci95"]):
             return f"method '{name}': 'nmae' is not over the horizon"
+        if _grids(entry) != _grids(first):
+            return f"method '{name}' was not measured at the points of the others"
     return None
+
+
+def _grids(entry: Entry) -> dict[str, Any]:
+    """Return where a method was measured: windows of steps, gaps, delivery probabilities."""
+    return {
+        "windows": sorted(entry["nmae_windows"]),
+        "gaps": [point["d"] for point in entry["gap_curve"]],
+        "probabilities": [point["p"] for point in entry["delivery_curve"]],
+    }
 
 
 def training_seed(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hjepa_cli.compute import memory
 from hjepa_cli.core.datasets import exports
 from hjepa_cli.core.datasets.dataset import (
     MANIFEST,
@@ -15,10 +16,10 @@ from hjepa_cli.core.datasets.dataset import (
     find_newest_dataset,
     load_dataset,
 )
-from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.control_law import control_law, control_of
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, HjepaError, MissingInputError, UsageError, require
+from hjepa_cli.errors import HjepaError, MissingInputError, UsageError, require
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan, seconds_of, size
 from hjepa_cli.storage import files
@@ -27,6 +28,7 @@ Result = dict[str, Any]
 
 ROOT = Path("data")
 FORMATS = {"hdf5": (".h5", ".hdf5"), "npz": (".npz",)}  # the first suffix is written by default
+MOST_NAMED = 20  # damaged files in one message
 COMPRESSED_FRAME_BYTES = 700
 
 
@@ -54,7 +56,8 @@ def show_info(screen: Screen, path: Path | None) -> Result:
 def verify(screen: Screen, paths: Sequence[Path]) -> Result:
     """Read every shard and check sha256, shapes and values; all of data/ if none is named.
 
-    Raise MissingInputError without any, and DataError for the first damaged one, after all of them.
+    Raise MissingInputError without any, and, after all of them, the error of the first shard or
+    dataset that is damaged or unreadable, which names the others too.
     """
     wanted = list(paths) or [
         ROOT / name for name in files.list_names(ROOT) if (ROOT / name / MANIFEST).exists()
@@ -66,8 +69,12 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
     for path in wanted:
         try:
             data = load_dataset(path)
+            flaws = list(data.flaws())
+            damaged += flaws
+            if flaws:
+                continue
             ranges = {name: spread(data.split(name)) for name in data.splits}
-        except (DataError, MissingInputError) as error:
+        except HjepaError as error:
             damaged.append(error)
             continue
         verified.append({**summary(data), "states": ranges})
@@ -79,10 +86,13 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
                 for name, spans in ranges.items()
             ],
         )
-    for further in damaged[1:]:
-        screen.say(further.message)
     if damaged:
-        raise damaged[0]
+        first = damaged[0]
+        if len(damaged) > 1:
+            named = [one.message for one in damaged[:MOST_NAMED]]
+            named += [f"{len(damaged) - MOST_NAMED} more"] * (len(damaged) > MOST_NAMED)
+            first.message = f"{len(damaged)} files are damaged or unreadable: {'; '.join(named)}"
+        raise first
     return {"verified": verified}
 
 
@@ -125,6 +135,7 @@ def export(
     """
     kind = chosen_format(out, kind)
     data = open_dataset(path, screen)
+    memory.check(held_bytes(data, split), f"split '{split}' of {data.path}")
     recorded = data.split(split)
     target = files.target(out or Path(f"{data.path.name}-{split}{FORMATS[kind][0]}"))
     system = plant(data.plant)
@@ -150,7 +161,7 @@ def export(
         if kind == "hdf5":
             exports.write_hdf5(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
         else:
-            exports.write_npz(target, values, filmed, about)
+            exports.write_npz(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
     names = sorted([*values, *(["pixels"] if pixels else [])])
     screen.say(f"{len(recorded)} trajectories, {', '.join(names)}: {target}")
     return {
@@ -238,12 +249,23 @@ def chosen_format(out: Path | None, kind: str | None) -> str:
     return kind or str(meant)
 
 
+def held_bytes(data: Dataset, split: str) -> int:
+    """Return what an export holds at once: the split twice while it is read, then its columns."""
+    described = data.splits.get(split, {"trajectories": 0, "steps": 0})
+    system = plant(data.plant)
+    row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
+    stored_bytes = HEIGHT_PX * WIDTH_PX * 3 * (data.frames == "stored")
+    return described["trajectories"] * (described["steps"] + 1) * (4 * row_bytes + 2 * stored_bytes)
+
+
 def plan_export(
     path: Path | None, out: Path | None, split: str, kind: str | None, pixels: bool
 ) -> Plan:
     """Plan ``hjepa data export``; arguments as of :func:`export`."""
     kind = chosen_format(out, kind)
     data = load_dataset(path or newest())
+    if split not in data.splits:
+        data.split(split)  # says so
     described = data.splits[split]
     rows = described["trajectories"] * (described["steps"] + 1)
     system = plant(data.plant)
@@ -260,4 +282,5 @@ def plan_export(
         writes=[f"{kind} file {target}"],
         writes_bytes=rows * row_bytes + frames * COMPRESSED_FRAME_BYTES,
         seconds=1 + seconds_of({"rendered frames": frames, "exported frames": frames}),
+        memory_bytes=held_bytes(data, split),
     )

@@ -16,7 +16,7 @@ from hjepa_cli.errors import DataError, Unavailable, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.serve import key_for
 from hjepa_cli.wire.actuator import Actuator, open_actuator
-from hjepa_cli.wire.bundle import Bundle, open_bundle
+from hjepa_cli.wire.bundle import Bundle, exported_by, open_bundle
 from hjepa_cli.wire.camera import Camera, Watched, open_camera, parse_crop
 from hjepa_cli.wire.device import Device, EverySteps, OnInnovation
 from hjepa_cli.wire.drive import Drive
@@ -64,7 +64,7 @@ def run(
     if not same_camera(bundle.manifest["camera"], kind):
         raise DataError(
             f"{model} was exported with another camera than plant {kind.name} has now",
-            hint=f"hjepa export MODEL --to {model}",
+            hint=exported_by(model),
         )
     runtime = Runtime(bundle, backend, precision)
     _, where = resolve(address, "--server")

@@ -100,15 +100,21 @@ def fit_network(
     optimiser: Optimiser,
     stream: Generator,
     draw: Callable[[], Drawn],
+    *,
+    phase: str | None = None,
 ) -> None:
-    """Train the one called ``name`` of a run's networks, as :meth:`TrainingRun.fit`."""
+    """Train the one called ``name`` of a run's networks, as :meth:`TrainingRun.fit`.
+
+    The ``phase`` has a name of its own where one network is trained in several.
+    """
+    phase = phase or name
 
     def report(step: int, loss: float) -> None:
         if step % REPORT_EVERY == 0 or step == optimiser.steps:
-            run.record.metric({"level": name, "step": step, "loss": loss})
+            run.record.metric({"level": phase, "step": step, "loss": loss})
 
     modules[name].train()
-    run.fit(name, optimiser, {"modules": modules}, stream, draw, report)
+    run.fit(phase, optimiser, {"modules": modules}, stream, draw, report)
     modules[name].eval()
 
 

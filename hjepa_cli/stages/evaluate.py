@@ -15,6 +15,7 @@ from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen, in_order
 from hjepa_cli.output.tables import show_evaluation
+from hjepa_cli.stages import results
 from hjepa_cli.stages.measuring import curves_for, plan_curves
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -52,16 +53,17 @@ def run(
     models = open_measurable(settings, screen, checkpoint, dataset, further, figure=figure)
     inputs = models.inputs(remeasure=remeasure, figure=figure)
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
-        result = record.result
+        result = recorded = record.result
         if result is None:
             result = record.finish(curves_for(models, screen, record, remeasure=remeasure))
-        else:
-            screen.say(f"{record.directory} is finished; this is its result")
-            for key in ("methods", "checkpoints"):  # stored in the order of the alphabet
-                result[key] = in_order(result.get(key, {}), settings.methods)
-        show_evaluation(result, screen)
-        if figure:
-            result["figures"] = draw(result, settings, record.directory, screen)
+        with results.showing("eval", recorded, record.directory):
+            if recorded is not None:
+                screen.say(f"{record.directory} is finished; this is its result")
+                for key in ("methods", "checkpoints"):  # stored in the order of the alphabet
+                    result[key] = in_order(result.get(key, {}), settings.methods)
+            show_evaluation(result, screen)
+            if figure:
+                result["figures"] = draw(result, settings, record.directory, screen)
         return result
 
 

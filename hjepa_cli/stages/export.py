@@ -6,7 +6,7 @@ Checkpoint → ONNX networks and a manifest → the same pictures through both �
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint
@@ -82,5 +82,5 @@ def checkpoint_of(bundle: Bundle) -> Path:
     raise DataError(
         f"{bundle.directory} was exported from a checkpoint that the zoo does not hold: "
         f"{wanted[:12]}…",
-        hint=f"name it: hjepa export PATH --check {bundle.directory}",
+        hint=f"name it: {shell(['hjepa', 'export', 'PATH', '--check', bundle.directory])}",
     )

@@ -6,6 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from hjepa_cli.compute.seeding import generator
+from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.batches import FrameWindows
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
@@ -52,7 +53,7 @@ def fit(
         mirror=options.mirror == "augment",
         shift_px=options.shift_px,
         mirrored_actions=kind.mirror,
-        labels=labels_of(train, kind, control_law(kind, settings.control)),
+        labels=labels_of(train, kind, control_law(kind, run.settings.control)),
         frames_each=options.frames,
     )
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories

@@ -9,7 +9,8 @@ from typing import Any
 from hjepa_cli.config.checks import needs_model, split_late
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.control.loop import LOOP_VERSION
+from hjepa_cli.core.control import link
+from hjepa_cli.core.control.loop import LOOP_VERSION, check_memory
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.bench import Bench
@@ -17,7 +18,8 @@ from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.evaluation.entries import MethodEntries
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.workers import open_workers
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.errors import DataError, UsageError, choices
 from hjepa_cli.output.screen import Screen, ticking
 from hjepa_cli.stages.model_set import ModelSet, how_to_train
 from hjepa_cli.stages.plan import seconds_of
@@ -34,6 +36,7 @@ def plan_curves(
 ) -> tuple[list[str], float]:
     """Return what :func:`curves_for` would do, by lines, and about how many seconds it takes."""
     protocol = models.settings.protocol
+    check_memory(protocol, max(protocol.curve_devices, protocol.bracket_devices))
     found = {} if remeasure else cached(models, methods)
     known, missing = ([name for name in methods if (name in found) is had] for had in (True, False))
     work = [f"take the cached curves of {', '.join(known)}"] if known else []
@@ -86,7 +89,8 @@ def curves_for(
     Returns:
         The document of ``eval --json``. Methods without a model are left out, and said.
     """
-    settings = models.settings
+    settings, protocol = models.settings, models.settings.protocol
+    check_memory(protocol, max(protocol.curve_devices, protocol.bracket_devices))
     models.say_skipped(settings.methods, screen)
     methods = models.measurable(settings.methods) if methods is None else methods
     shares = [
@@ -114,9 +118,10 @@ def curves_for(
         "plant": settings.plant,
         "seed": settings.seed,
         "loop_version": LOOP_VERSION,
-        "acceptable_score": settings.protocol.acceptable_score,
-        "acceptable_lq_ratio": settings.protocol.acceptable_lq_ratio,
-        "horizon": list(range(settings.protocol.horizon + 1)),
+        "link": link.facts(protocol, len(plant(settings.plant).force_signs)),
+        "acceptable_score": protocol.acceptable_score,
+        "acceptable_lq_ratio": protocol.acceptable_lq_ratio,
+        "horizon": list(range(protocol.horizon + 1)),
         "methods": {name: found[name][0] for name in methods},
         "skipped": models.skipped(settings.methods),
         "curves": record.path(CURVES_FILE),
@@ -193,7 +198,7 @@ def measure_points(
     settings, protocol = models.settings, models.settings.protocol
     if split_late(method)[0] not in models.methods:
         raise UsageError(
-            f"no model for method '{method}'; choose from {', '.join(models.methods)}",
+            f"no model for method '{method}'; {choices(method, models.methods)}",
             hint=how_to_train(method, settings),
         )
     points = [Point("gap", gap) for gap in gaps]

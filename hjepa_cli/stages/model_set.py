@@ -28,7 +28,7 @@ from hjepa_cli.storage import runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 from hjepa_cli.storage.zoo import CURVES_FILE
 
-TRAINING = ("train-encoder", "train-hierarchy", "train-reflex")
+TRAINING = ("train-encoder", "train-hierarchy", "train-reflex", "train-fusion")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,14 +215,19 @@ def default_model(settings: Settings, screen: Screen) -> Path | None:
         return config.get("plant") == settings.plant and (len(strides) > 1 or not several)
 
     for several in (True, False):
-        directory = runs.newest_run("train-hierarchy", lambda run, s=several: fits(run, s))
+        directory = runs.newest_run(
+            "train-hierarchy", lambda run, s=several: fits(run, s), preset=settings.preset
+        )
         if directory:
             screen.say(f"model of the newest run, {directory}")
             return directory / MODEL_FILE
+    if passed := runs.newest_run("train-hierarchy", lambda run: fits(run, False)):
+        screen.say(f"{passed} is of preset smoke, too small to learn: not used unless it is named")
     hierarchy = settings.hierarchy
     path = zoo.find_model(settings.plant, (hierarchy.h, hierarchy.m, hierarchy.l))
     if path:
-        screen.say(f"no run of train-hierarchy here: model {path.parent.name} of the zoo")
+        other = "no other run" if passed else "no run"
+        screen.say(f"{other} of train-hierarchy here: model {path.parent.name} of the zoo")
         return path
     screen.say(f"no model of plant {settings.plant}: true-state methods only")
     return None
@@ -235,7 +240,8 @@ def _find(
 
     With a ``seed`` only models that were trained with it.
     """
-    trained = (directory / MODEL_FILE for directory in runs.finished_runs(*TRAINING))
+    finished = runs.finished_runs(*TRAINING, preset=settings.preset)
+    trained = (directory / MODEL_FILE for directory in finished)
     published = map(zoo.resolve_model, zoo.list_models())
     found = []
     for path in itertools.chain(filter(Path.is_file, trained), published):

@@ -11,6 +11,12 @@ def _stage(name: str, help: str, module: str, **more: Any) -> Stage:
     return Stage(name, help, run, plan, **more)
 
 
+TUNE_LAW = _stage(
+    "tune-law",
+    "Search a control law that holds a plant between sparse packets, for models to learn.",
+    "tune_law",
+    product="law",
+)
 COLLECT = _stage(
     "collect",
     "Simulate cart-poles under an exploring teacher and store them as a dataset.",
@@ -36,6 +42,13 @@ TRAIN_REFLEX = _stage(
     "train-reflex",
     "Train rivals of the predictors: what a packet and its age say, without predicting anything.",
     "train_reflex",
+    inputs=("dataset", "checkpoint"),
+    product="checkpoint",
+)
+TRAIN_FUSION = _stage(
+    "train-fusion",
+    "Train what a hierarchy makes of packets that are not quite right, in noise or few bits.",
+    "train_fusion",
     inputs=("dataset", "checkpoint"),
     product="checkpoint",
 )

@@ -32,7 +32,10 @@ RATES_PER_S = {  # two cores of a server CPU
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """It says in lines what a command reads, does and writes, taking ``seconds`` on two cores."""
+    """It says in lines what a command reads, does and writes, taking ``seconds`` on two cores.
+
+    ``memory_bytes`` is what grows with sizes, besides the program and its libraries.
+    """
 
     command: str
     reads: list[str]
@@ -40,6 +43,7 @@ class Plan:
     writes: list[str]
     writes_bytes: int
     seconds: float
+    memory_bytes: float = 0
 
     def show(self, screen: Screen) -> None:
         """Print the plan, one line per item, or as one JSON document."""
@@ -51,7 +55,9 @@ class Plan:
         for verb, lines in (("read", self.reads), ("do", self.work), ("write", self.writes)):
             for line in lines or ["nothing"]:
                 screen.result(f"  {verb:6}{line}")
-        screen.result(f"  in about {duration(self.seconds)}, {size(self.writes_bytes)} on disk")
+        held = f", {size(self.memory_bytes)} of memory" if self.memory_bytes else ""
+        on_disk = size(self.writes_bytes)
+        screen.result(f"  in about {duration(self.seconds)}, {on_disk} on disk{held}")
 
 
 def seconds_of(amounts: Mapping[str, float]) -> float:

@@ -7,7 +7,7 @@ the commands that make it again. Figures can also be written as files for a pape
 import base64
 import csv
 import io
-import shlex
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,17 +16,25 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefi
 
 from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
+from hjepa_cli.stages import results
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
 Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
-STAGES = ("train-encoder", "train-hierarchy", "train-reflex", "eval", "scale", "bench-link")
+STAGES = (
+    "train-encoder",
+    "train-hierarchy",
+    "train-reflex",
+    "train-fusion",
+    "eval",
+    "scale",
+    "bench-link",
+)
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
-SMOKE = "smoke"
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
 
 
@@ -51,19 +59,23 @@ def run(
     directories = found_runs(paths)
     template = page_template()
     section = template.make_module(dict.fromkeys(("runs", "sections", "note"), ())).section
-    described, sections, written = [], [], []
+    described, sections, written, names = [], [], [], figure_names(directories)
     for directory in directories:
         one = describe(directory)
         try:
             drawn = draw(one, directory, screen)
             one["figures"] = [(text, _svg(figure)) for text, figure in drawn.values()]
             sections.append(section(one))
-        except (UndefinedError, KeyError, TypeError, IndexError, AttributeError) as error:
-            raise damaged(directory, error) from None
+        except (UndefinedError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+            missing = str(error).rpartition("has no attribute ")[2]
+            raise results.damaged(directory, one["stage"], missing) from None
+        except UsageError as error:  # of a plant that no plugin in force adds
+            raise results.damaged(directory, one["stage"], error) from None
         described.append(one)
         if figures is not None:
-            written += write_figures(drawn, figures, one["stage"], formats)
-    note = NO_RESULT if any(one["preset"] == SMOKE for one in described) else ""
+            name = names[directory]
+            written += write_figures(drawn, figures, name, formats)
+    note = NO_RESULT if any(one["preset"] == runs.SMOKE for one in described) else ""
     text = template.render(runs=described, sections=sections, note=note)
     files.write_text(files.target(out), text)
     if figures is not None:
@@ -84,7 +96,7 @@ def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") 
         if not below:
             if (path / runs.CONFIG).is_file():
                 raise MissingInputError(
-                    f"{path} is an unfinished run", hint=f"hjepa resume {shlex.quote(str(path))}"
+                    f"{path} is an unfinished run", hint=shell(["hjepa", "resume", path])
                 )
             raise MissingInputError(f"no finished run in {path}", hint=made_by)
         found += below
@@ -127,29 +139,23 @@ def page_template() -> Template:
 def describe(directory: Path) -> dict[str, Any]:
     """Return what the page says of a run. Raises DataError or MissingInputError."""
     environment, stage = runs.read_environment(directory), stage_of(directory)
+    result, settings = runs.read_result(directory), runs.read_config(directory)
+    results.check(stage, result, directory)
+    results.check_config(stage, settings, directory)
     config = directory / runs.CONFIG
     versions = {f"version of {name}": v for name, v in environment.get("versions", {}).items()}
     return {
         "stage": stage,
         "directory": directory,
-        "preset": environment["preset"],
+        "preset": environment.get("preset"),
         "made_by": runs.version_of(environment),
-        "result": runs.read_result(directory),
-        "config": runs.read_config(directory),
-        "command": shlex.join(["hjepa", *map(str, environment.get("command", [])[1:])]),
-        "again": shlex.join(["hjepa", stage, "--config", str(config), *inputs_of(environment)]),
+        "result": result,
+        "config": settings,
+        "command": shell(["hjepa", *map(str, environment.get("command", [])[1:])]),
+        "again": shell(["hjepa", stage, "--config", str(config), *inputs_of(environment)]),
         "environment": versions | {key: environment.get(key) for key in MACHINE},
         "toml": files.read_bytes(config, limit=files.JSON_LIMIT_BYTES).decode(),
     }
-
-
-def damaged(directory: Path, error: Exception) -> DataError:
-    """Return the error of a result that lacks what its stage writes."""
-    stage, missing = stage_of(directory), str(error).rpartition("has no attribute ")[2]
-    return DataError(
-        f"{directory / runs.RESULT} lacks what a {stage} run has: {missing}",
-        hint=f"hjepa {stage} --config {directory / runs.CONFIG}",
-    )
 
 
 def inputs_of(environment: Mapping[str, Any]) -> list[str]:
@@ -188,17 +194,27 @@ def _svg(figure: Any) -> str:
     return base64.b64encode(encoded(figure, "svg")).decode()
 
 
-def write_figures(
-    drawn: Figures, directory: Path, stage: str, formats: Sequence[str]
-) -> list[Path]:
-    """Write figures as ``<stage>-<name>.<format>``."""
+def figure_names(directories: Sequence[Path]) -> dict[Path, str]:
+    """Return what the figures of each run begin with: its stage, of several also which run."""
+    names: dict[Path, str] = {}
+    for directory in directories:
+        stage = stage_of(directory)
+        alone = sum(stage_of(other) == stage for other in directories) == 1
+        name = stage if alone else f"{stage}-{directory.resolve().name}"
+        taken = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+        names[directory] = next(one for one in taken if one not in names.values())
+    return names
+
+
+def write_figures(drawn: Figures, directory: Path, run: str, formats: Sequence[str]) -> list[Path]:
+    """Write figures as ``<run>-<name>.<format>``."""
     if not drawn:
         return []
     from hjepa_cli.output.figures import save
 
     files.make_directory(directory)
     return [
-        save(figure, directory / f"{stage}-{name}.{kind}")
+        save(figure, directory / f"{run}-{name}.{kind}")
         for name, (_, figure) in drawn.items()
         for kind in formats
     ]
@@ -275,7 +291,7 @@ def wire_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path
 
 
 FIGURES: dict[str, Callable[..., Figures]] = {
-    **dict.fromkeys(("train-encoder", "train-hierarchy", "train-reflex"), training_figures),
+    **{stage: training_figures for stage in STAGES if stage.startswith("train-")},
     "eval": eval_figures,
     "scale": scale_figures,
     "bench-link": wire_figures,

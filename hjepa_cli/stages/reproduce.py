@@ -25,7 +25,7 @@ from hjepa_cli.stages.plan import Plan, run_directory
 from hjepa_cli.stages.scale import plan_searches
 from hjepa_cli.stages.training import check_stride
 from hjepa_cli.storage.checkpoints import MODEL_FILE
-from hjepa_cli.storage.runs import Run
+from hjepa_cli.storage.runs import SMOKE, Run
 
 MEASURING = ("eval", "scale")  # the stages that drive a model
 
@@ -41,7 +41,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             screen.say(f"{record.directory} is finished; this is its result")
             return record.result
         folder = record.directory
-        if settings.preset == report.SMOKE:
+        if settings.preset == SMOKE:
             screen.say(report.NO_RESULT)
         for name in left_out(settings):
             how = how_to_train(name, settings)

@@ -4,7 +4,6 @@ The run remembers its settings (``config.toml``) and what it was given (``enviro
 """
 
 import dataclasses
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from hjepa_cli.compute import torchrun
 from hjepa_cli.config.checks import check_settings
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.datasets.dataset import MANIFEST
-from hjepa_cli.errors import DataError, MissingInputError, UsageError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import STAGES
 from hjepa_cli.stages.collect import describe_finished, recorded_settings
@@ -22,6 +21,7 @@ from hjepa_cli.stages.stage import Stage
 from hjepa_cli.storage.runs import (
     CONFIG,
     RESULT,
+    anew,
     check_plugins,
     load_recorded,
     read_environment,
@@ -44,7 +44,7 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
     stage, settings, inputs = recall(directory, screen)
     if not stage.shared:
         torchrun.refuse()
-    return stage.run(settings, screen, out=directory, **given_to(stage, inputs))
+    return stage.run(settings=settings, screen=screen, out=directory, **given_to(stage, inputs))
 
 
 def plan(directory: Path) -> Plan:
@@ -52,7 +52,7 @@ def plan(directory: Path) -> Plan:
     if any((directory / name).exists() for name in (MANIFEST, RESULT)):
         return Plan(f"resume {directory}", [f"{directory}, which is finished"], [], [], 0, 0.0)
     stage, settings, inputs = recall(directory, Screen(quiet=True))
-    whole = stage.plan(settings, out=directory, **given_to(stage, inputs))
+    whole = stage.plan(settings=settings, out=directory, **given_to(stage, inputs))
     work = ["go on where it was interrupted; from the start it would", *whole.work]
     return dataclasses.replace(whole, command=f"resume {directory}", work=work)
 
@@ -85,6 +85,7 @@ def recall(directory: Path, screen: Screen) -> tuple[Stage, Settings, dict[str, 
     if (directory / LOG).exists():
         return STAGES["collect"], recorded_settings(directory), {}
     found = read_environment(directory)
+    check_plugins(directory, found)
     if found["stage"] not in STAGES:
         raise DataError(
             f"{directory} holds a run of '{found['stage']}', which this hjepa does not know"
@@ -94,9 +95,8 @@ def recall(directory: Path, screen: Screen) -> tuple[Stage, Settings, dict[str, 
         kept = isinstance(words, list) and all(isinstance(word, str) for word in words)
         raise MissingInputError(
             f"{directory} was stopped before its settings were kept: there is nothing to continue",
-            hint=shlex.join(["hjepa", *words[1:]]) if kept else None,
+            hint=shell(["hjepa", *words[1:]]) if kept else None,
         )
-    check_plugins(directory, found)
     preset, made_by = found.get("preset"), version_of(found) or __version__
     if preset is not None and not isinstance(preset, str):
         raise DataError(f"{directory} is of preset {preset!r}")
@@ -108,7 +108,7 @@ def recall(directory: Path, screen: Screen) -> tuple[Stage, Settings, dict[str, 
             raise
         raise UsageError(
             f"{directory} was made by hjepa {made_by}, this is {__version__}: {error.message}",
-            hint=f"take it up with hjepa {made_by}; or anew: hjepa {found['stage']} --out DIR",
+            hint=f"take it up with hjepa {made_by}; or anew: {anew(found)} --out DIR",
         ) from None
     if made_by != __version__:
         screen.say(f"begun by hjepa {made_by}, this is {__version__}: results may differ")

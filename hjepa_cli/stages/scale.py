@@ -13,6 +13,7 @@ from typing import Any
 
 from hjepa_cli.config.checks import check_cell
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.capacity import parse_snr
@@ -20,6 +21,7 @@ from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import LAWS
+from hjepa_cli.stages import results
 from hjepa_cli.stages.evaluate import reads_of
 from hjepa_cli.stages.measuring import plan_curves, seconds_of_loops
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -71,7 +73,7 @@ def run(
     if "remeasure" in LAWS[radio.law].uses:
         given["remeasure"] = remeasure
     with Run.create("scale", out, settings.as_dict(), count.models.inputs(**given)) as record:
-        result = record.result
+        result = recorded = record.result
         if result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
         else:
@@ -80,6 +82,7 @@ def run(
                 "plant": settings.plant,
                 "seed": settings.seed,
                 "acceptable_score": settings.protocol.acceptable_score,
+                "link": link.facts(settings.protocol, len(kind.force_signs)),
                 "law": radio.law,
                 "bandwidth_hz": radio.bandwidth_hz,
                 "slot_s": kind.step_s,
@@ -92,9 +95,10 @@ def run(
             result["csv"] = write_csv(record.path("devices.csv"), result["rows"], count.columns)
             result["figures"] = draw(result, record.directory, screen)
             result = record.finish(result)
-        count.show(result)
-        screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
-        enforce(result)
+        with results.showing("scale", recorded, record.directory):
+            count.show(result)
+            screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
+            enforce(result)
         return result
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from hjepa_cli.config.checks import late
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
 from hjepa_cli.core.plants.frames import FRAME_BITS
 from hjepa_cli.core.plants.named import plant
@@ -139,7 +140,9 @@ class ByFormula:
         if METHODS[method].sends != "frames":
             return method
         bits = int(method.rpartition("-")[2]) * FRAME_BITS
-        delay_slots = self._law.delay_slots(self._cell.link(bits, snr_db))
+        forces = len(plant(self._settings.plant).force_signs)
+        bits += link.confirmation_bits(self._settings.protocol, forces)
+        delay_slots = self._law.asked("delay_slots", self._cell.link(bits, snr_db))
         return late(method, math.ceil(delay_slots * (1 - ROUNDING)))
 
     def _verify(self, loop: LinkRequirement) -> list[Row]:
@@ -168,7 +171,7 @@ class ByFormula:
 
 def described(result: Mapping[str, Any]) -> str:
     """Return the cell of a result in a few words."""
-    law = f"{result['law']} law"
+    law = f"{result['law']} law{link.described(result.get('link', {}))}"
     if result.get("noise") == "scaled" and "radio.noise" in LAWS[result["law"]].uses:
         law += ", scaled noise"
     return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"

@@ -12,6 +12,8 @@ from typing import Any
 
 from hjepa_cli.config.checks import check_schedulable, check_warmup
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control import link
+from hjepa_cli.core.control.loop import check_memory
 from hjepa_cli.core.evaluation.device_ratios import best_flat, ratio_of
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES
 from hjepa_cli.core.evaluation.workers import open_workers
@@ -54,6 +56,7 @@ class BySimulation:
         linked = [name for name in settings.methods if METHODS[name].needs_link]
         check_schedulable(linked, settings.protocol.total_steps)
         check_warmup(settings.protocol)
+        check_memory(settings.protocol, BLOCK_DEVICES)
         self._settings, self._screen = settings, screen
         self.models = open_model_set(settings, screen, checkpoint, None, further)
         self.methods = self.models.measurable(linked)
@@ -126,6 +129,7 @@ class BySimulation:
         screen, grid_db = self._screen, list(dict.fromkeys(row["snr_db"] for row in result["rows"]))
         lines = [row for row in result["rows"] if row["snr_db"] == grid_db[0]]
         sample = f"{result['seeds']} seeds" if result["seeds"] > 1 else f"seed {result['seed']}"
+        sample += link.described(result.get("link", {}))
         screen.table(
             f"one resource block of {result['plant']} loops at score "
             f"{result['acceptable_score']:g}, {grid_db[0]:g} dB: {sample}, 95 % CI; "
@@ -159,6 +163,10 @@ class BySimulation:
                 for label in map(_label, lines)
             ],
         )
+        covered = {row["snr_db"]: row["coverage"] for row in result["rows"] if "coverage" in row}
+        if covered:
+            shares = ", ".join(f"{share:.0%} at {at:g} dB" for at, share in covered.items())
+            screen.result(f"devices of the hall whose power suffices at mean fading: {shares}")
         title, at = "simulated again, inside and outside each load", ("load", "devices/block")
         show_verdicts(result, screen, title, "method, scheduler", *at, digits=1)
         for found in result["gains"]:

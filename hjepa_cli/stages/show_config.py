@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from hjepa_cli.config.schema import Settings, dotted
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import UsageError, meant
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.storage.runs import to_toml
 
@@ -33,7 +33,8 @@ def show(
     shown = [name for name in named if name in values]  # empty lists say nothing
     if not shown:
         sections = sorted({name.split(".")[0] for name in sources})
-        raise UsageError(f"no setting or section '{key}'; choose from {', '.join(sections)}")
+        near = meant(key, [*sections, *values])
+        raise UsageError(f"no setting or section '{key}'; {near}choose from {', '.join(sections)}")
     if as_toml:
         chosen = settings.as_dict()
         if key:  # this section or value alone, and the preset that all are of

@@ -24,9 +24,9 @@ from hjepa_cli.core.training.optimiser import fit_actor
 from hjepa_cli.core.training.ranks import joined
 from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
 from hjepa_cli.core.training.shared_norm import share_statistics
-from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.errors import NumericalError, UsageError, shell
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.output.tables import show_gates
+from hjepa_cli.output.tables import measured, show_gates
 from hjepa_cli.stages import baselines
 from hjepa_cli.stages.frame_training import fit
 from hjepa_cli.stages.inputs import count_frames, embed, open_dataset
@@ -135,14 +135,14 @@ def train_and_gate(run: TrainingRun) -> dict[str, Any]:
     following, flag = ("train-hierarchy", "--encoder") if is_jepa else ("eval", "--checkpoint")
     if not accepted:
         failed = [
-            f"{name} {gate['value']:.3f} (gate {gate['threshold']:g})"
+            f"{name} {measured(gate['value'])} (gate {gate['threshold']:g})"
             for name, gate in gates.items()
             if not gate["passed"]
         ]
         raise NumericalError(
             f"the encoder failed its gate: {', '.join(failed)}",
             hint="collect more trajectories or train for more steps; --no-gate skips the gate, and "
-            f"hjepa {following} {flag} {path} goes on with this one",
+            f"{shell(['hjepa', following, flag, path])} goes on with this one",
         )
     result = run.finish(health=report, gates=gates)
     screen.say(f"{path} in {result['seconds']:.0f} s; next: hjepa {following}")
@@ -261,10 +261,13 @@ def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any
             "action_sensitivity": options.gate_sensitivity,
         }
     values = dotted(report, "_")
-    gates = {
-        name: {"value": values[name], "threshold": bound, "passed": values[name] >= bound}
+    bounds["actor_nrmse"] = options.gate_actor_nrmse
+
+    def passed(name: str, bound: float) -> bool:
+        value = values[name]  # None: undefined, as of a state that is the same everywhere
+        return value is not None and (value <= bound if name == "actor_nrmse" else value >= bound)
+
+    return {
+        name: {"value": values[name], "threshold": bound, "passed": passed(name, bound)}
         for name, bound in bounds.items()
     }
-    error, limit = values["actor_nrmse"], options.gate_actor_nrmse
-    gates["actor_nrmse"] = {"value": error, "threshold": limit, "passed": error <= limit}
-    return gates

@@ -182,7 +182,8 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
             alike = all(encoder[key] == wanted[key] for key in train_encoder.ARCHITECTURE)
             return is_jepa and alike and config["plant"] == settings.plant
 
-        name = newest_run("train-encoder", fits) or find_model(settings.plant)
+        newest = newest_run("train-encoder", fits, preset=settings.preset)
+        name = newest or find_model(settings.plant)
         if name is None:
             raise MissingInputError(
                 f"no finished train-encoder run of plant {settings.plant} and these settings "
@@ -245,7 +246,7 @@ def describe_architecture(
 @torch.inference_mode()
 def examine(
     modules: nn.ModuleDict, test: RenderedSplit, h: int, settings: Settings
-) -> dict[str, float]:
+) -> dict[str, float | None]:
     """Return the held-out health of what this stage trained: the actor and the coarsest level."""
     z = embed(modules["encoder"], test, settings)
     names = ("actor", "high" if "high" in modules else "flat")

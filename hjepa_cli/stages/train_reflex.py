@@ -292,7 +292,8 @@ def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[st
     searched = {"candidates": options.search_candidates, "rounds": options.search_rounds}
     screen.say("searching laws whose force fades, on the true state")
     kind, devices = plant(settings.plant), options.search_devices
-    trial = Trial.make(kind, protocol, devices=devices, steps=options.search_steps, seed=seed)
+    act = control_law(kind, settings.control)
+    trial = Trial.make(kind, act, protocol, devices=devices, steps=options.search_steps, seed=seed)
     law, _ = decay_fit.search_law(trial, seed=seed, **searched)
     faded, gain = decay_fit.search_law(trial, seed=seed, tied=True, **searched)
     said = {

@@ -16,6 +16,7 @@ import torch
 from numpy.random import Generator
 from torch import Tensor, nn
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.device import autocast, keep_freed_memory, resolve_device
 from hjepa_cli.compute.torchrun import ContactLost
 from hjepa_cli.compute.versions import versions
@@ -23,6 +24,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.datasets.dataset import Dataset, Trajectories
 from hjepa_cli.core.networks.model import build_modules
 from hjepa_cli.core.plants.control_law import control_of
+from hjepa_cli.core.plants.frames import FRAME_BITS
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.progress import Part, Progress
@@ -30,7 +32,8 @@ from hjepa_cli.core.training.ranks import ALONE, Ranks
 from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.inputs import open_dataset, render
+from hjepa_cli.stages import results
+from hjepa_cli.stages.inputs import count_frames, open_dataset, render
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint
 from hjepa_cli.storage.files import canonical_json
@@ -59,9 +62,13 @@ class TrainingRun:
 
     def render(self) -> list[RenderedSplit]:
         """Return the frames of both splits, for training and held out."""
-        return [
+        splits = [
             render(of, self.settings, self.screen, split) for split, of in self.recorded.items()
         ]
+        for name, split in zip(self.recorded, splits, strict=True):
+            if (split.frames == split.frames[0, 0]).all():
+                raise _still(self.dataset, name, "frames")
+        return splits
 
     def metadata(self, architecture: Architecture, **further: Any) -> dict[str, Any]:
         """Return what a checkpoint of this run says of itself, ``further`` included."""
@@ -126,9 +133,22 @@ def open_training_data(path: Path | None, settings: Settings, *, h: int = 0) -> 
     """
     resolve_device(settings.device)  # refused before anything is read
     dataset = open_dataset(path, settings)
+    frames = count_frames(dataset, settings, *SPLITS)
+    memory.check(rendered_bytes(frames), f"training on {frames} frames")
     recorded = {split: dataset.split(split) for split in SPLITS}
     check_stride(h, recorded["train"].steps)
+    for name, split in recorded.items():
+        if (split.states == split.states[0, 0]).all():
+            raise _still(dataset, name, "states")
     return dataset, recorded
+
+
+def _still(dataset: Dataset, split: str, what: str) -> DataError:
+    """Return the error of data without variance, of which nothing can be learned."""
+    return DataError(
+        f"dataset {dataset.path}: all {what} of split '{split}' are equal: nothing moves in it",
+        hint="hjepa collect with other starts or exploration in [collect] of --config FILE.toml",
+    )
 
 
 def run_training(
@@ -176,7 +196,8 @@ def run_training(
                 hint="keep --dataset and --out on a disk that all machines share",
             )
         if record.result is not None:
-            show(record.result, screen)
+            with results.showing(stage, record.result, record.directory):
+                show(record.result, screen)
             return record.result
         run = TrainingRun(stage, settings, dataset, recorded, record, progress, screen, ranks)
         try:
@@ -206,7 +227,13 @@ def plan_training(
         writes=[f"run {run_directory(stage, out)}"],
         writes_bytes=sum(tensor.nbytes for tensor in tensors),
         seconds=5 + seconds_of(amounts),
+        memory_bytes=rendered_bytes(amounts.get("rendered frames", 0)),
     )
+
+
+def rendered_bytes(frames: float) -> float:
+    """Return what a training's frames take while they are rendered: as parts, and as a whole."""
+    return 2 * frames * FRAME_BITS / 8
 
 
 def check_stride(h: int, steps: int) -> None:

@@ -5,18 +5,32 @@ pole, the pole that a linear probe reads from the controller's current embedding
 SNR and the age of the last packet. It shows a handful of devices; numbers come from ``eval``.
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.drivers import build_driver, methods_of
-from hjepa_cli.core.control.loop import Bools, Controller, Draws, Floats, gap_schedule, simulate
+from hjepa_cli.core.control.link import described
+from hjepa_cli.core.control.link import facts as link_facts
+from hjepa_cli.core.control.loop import (
+    Bools,
+    Controller,
+    Draws,
+    Floats,
+    LinkDraws,
+    check_memory,
+    gap_schedule,
+    simulate,
+    takes_ages,
+)
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
@@ -26,7 +40,7 @@ from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.radio.channel import rayleigh_power_gains
 from hjepa_cli.core.radio.laws.equal import equal_devices
-from hjepa_cli.errors import MissingInputError, UsageError, require
+from hjepa_cli.errors import MissingInputError, UsageError, choices, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import CODECS, METHODS
@@ -42,14 +56,16 @@ class Believer:
     """A linear probe reads, at every step, what a controller of n devices believes."""
 
     def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
-        self._controller, self._probe = controller, probe
+        self._controller: Any = controller
+        self._probe = probe
         self._last: torch.Tensor | None = None
         self._heard = False
         self.believed: list[Floats] = []
 
     def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]."""
-        forces_n = self._controller.act(delivered, packets, ages)
+        told = (ages,) if takes_ages(self._controller) else ()
+        forces_n: Floats = self._controller.act(delivered, packets, *told)
         self._heard |= packets is not None
         if not self._heard:  # the link is late: a device is believed to be at rest
             states = np.zeros((len(delivered), self._probe.shape[1]))
@@ -66,6 +82,10 @@ class Believer:
             states = self._read(self._last)
         self.believed.append(states)
         return forces_n
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the controller tells besides, as the forces that it has planned."""
+        return getattr(self._controller, name)
 
     def _read(self, z: torch.Tensor) -> Floats:
         return np.asarray(health.read_probe(self._probe, z.cpu()).numpy())
@@ -103,18 +123,15 @@ def run(
             do not write, more pictures per second than a GIF holds, no terminal.
         MissingInputError: no model, or a library is missing.
     """
-    require("PIL", "a view needs Pillow", "plot")
+    check(settings, screen, out=out, devices=devices, every=every, fps=fps, live=live)
     from hjepa_cli.output import animation
     from hjepa_cli.output import live as terminal
 
     if not live:
-        animation.check_target(out, fps)
         out = files.target(out)
-    elif not screen.is_terminal:
-        raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
     models = open_viewable(settings, screen, checkpoint)
     link = make_link(settings, models.model, devices, snr_db, delivery, gap_steps)
-    screen.say(link.label)
+    screen.say(link.label + link.late)
     probe = fit_probe(settings, models.model, screen)
     films = [film(name, settings, models.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.total_steps // 100, 1)
@@ -127,7 +144,7 @@ def run(
             one.method: {"share_in_band": one.score.mean(axis=0), **belief_errors(one, kind)}
             for one in films
         },
-        "delivered": link.delivered.mean(),
+        "delivered": link.sent.mean(),
         "pictures": len(pictures),
         "file": None if live else out,
     }
@@ -141,10 +158,45 @@ def run(
     return result
 
 
+def check(
+    settings: Settings,
+    screen: Screen,
+    *,
+    out: Path,
+    devices: int,
+    every: int | None,
+    fps: int,
+    live: bool,
+) -> None:
+    """Refuse what could not be drawn, before any work; arguments and errors as of :func:`run`."""
+    require("PIL", "a view needs Pillow", "plot")
+    from hjepa_cli.output import animation
+
+    check_memory(settings.protocol, devices)
+    if live:
+        if not screen.is_terminal:
+            raise UsageError("--live needs a terminal", hint="hjepa view --out FILE.gif")
+        return
+    animation.check_target(out, fps, devices, len(settings.methods))
+    steps = settings.protocol.total_steps
+    pictures = steps // every if every else 100
+    size = math.prod(animation.size_px(devices, len(settings.methods)))
+    memory.check(pictures * size, f"{pictures} pictures of {devices} devices")
+
+
 def plan(
-    settings: Settings, *, checkpoint: str | None, out: Path, devices: int, live: bool
+    settings: Settings,
+    screen: Screen,
+    *,
+    checkpoint: str | None,
+    out: Path,
+    devices: int,
+    every: int | None,
+    fps: int,
+    live: bool,
 ) -> Plan:
     """Plan a film; arguments as of :func:`run`."""
+    check(settings, screen, out=out, devices=devices, every=every, fps=fps, live=live)
     models = open_viewable(settings, Screen(quiet=True), checkpoint)
     steps, methods = settings.protocol.total_steps, settings.methods
     frames = 2 * len(methods) * devices * steps / 20 + 2000  # a packet in twenty; the probe's
@@ -183,8 +235,7 @@ def open_viewable(settings: Settings, screen: Screen, checkpoint: str | None) ->
     for name in settings.methods:
         if name not in viewable:
             raise UsageError(
-                f"method '{name}' cannot be viewed with this model; "
-                f"choose from {', '.join(viewable)}",
+                f"method '{name}' cannot be viewed with this model; {choices(name, viewable)}",
                 hint=f"hjepa view --methods {viewable[0]}",
             )
     return models
@@ -204,21 +255,25 @@ def make_link(
     the law ``equal`` for as many devices as bring p about.
     """
     steps, kind = settings.protocol.total_steps, plant(settings.plant)
+    draws = LinkDraws.make(settings.protocol, devices, settings.seed)
+    facts = link_facts(settings.protocol, len(kind.force_signs))
+    late = described(facts)
     if gap_steps is not None:
         schedule = gap_schedule(gap_steps, steps, devices)
         label = f"a packet every {gap_steps:g} steps, SNR {snr_db:g} dB by power control"
-        return Link(schedule, np.full((steps, devices), snr_db), False, label)
+        return Link(schedule, np.full((steps, devices), snr_db), False, label, draws, late)
     streams = [generator(settings.seed, FADING_KEY, device) for device in range(devices)]
     gains = np.stack([rayleigh_power_gains(stream, steps) for stream in streams], axis=1)
     delivered = gains >= -np.log(delivery)
     delivered[0] = True
     bits = CODECS[settings.protocol.payload].bits(model.architecture["embedding"])
+    bits += int(facts["confirmation_bits"])
     sharing = equal_devices(delivery, bits, settings.radio.bandwidth_hz, kind.step_s, snr_db)
     label = (
         f"Rayleigh fading, mean SNR {snr_db:g} dB, packets arrive with p = {delivery:g}: "
         f"{sharing} devices share {settings.radio.bandwidth_hz / 1e6:g} MHz"
     )
-    return Link(delivered, snr_db + 10 * np.log10(gains), True, label)
+    return Link(delivered, snr_db + 10 * np.log10(gains), True, label, draws, late)
 
 
 def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
@@ -243,14 +298,14 @@ def film(
     """Drive the devices with one method and keep every state and belief."""
     kind = actual_plant(settings.plant, settings.conditions)
     method = build_driver(name, settings, model)
-    steps, devices = link.delivered.shape
+    steps, devices = link.sent.shape
     believer = Believer(method.controller(devices), probe)
     states: list[Floats] = []
     with screen.progress(f"simulate {name}", steps, "steps") as bar:
         simulate(
             kind,
             Draws.make(settings.protocol, devices, settings.seed),
-            link.delivered[None],
+            link.sent[None],
             believer,
             method.sensor,
             tick=bar.advance,

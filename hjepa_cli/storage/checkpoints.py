@@ -20,6 +20,7 @@ from hjepa_cli.storage.files import (
     check_schema,
     parse_json,
     read_bytes,
+    reading,
     write_bytes,
 )
 
@@ -69,6 +70,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         DataError: truncated, foreign, tampered, not finite, or of a newer schema.
     """
     try:
+        if path.is_file():
+            with reading(path):
+                arrays.check_header(path)
         data = read_bytes(path, limit=SIZE_LIMIT_BYTES)
     except MissingInputError:
         raise MissingInputError(

@@ -8,7 +8,6 @@ helpers serve run directories and datasets.
 import contextlib
 import errno
 import fcntl
-import functools
 import io
 import itertools
 import json
@@ -18,6 +17,7 @@ import re
 import secrets
 import shutil
 import stat
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -35,23 +35,46 @@ _HOLDER = re.compile(rb"process \d{1,20} on [\w.-]{1,64}")
 _AGAIN = "run the same command again"
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Replace ``path`` by ``data`` atomically, with a mode by the umask; else StorageError."""
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Replace ``path`` atomically by what is written inside; mode by the umask; else StorageError.
+
+    An error inside leaves the old file.
+    """
     # Workers in containers have equal pids, and two may write the same shard at the same time.
     _refuse_special(path)
     unique = f"{secrets.token_hex(4)}.{os.getpid()}"
     temporary = path.with_name(f".{path.name}.{unique}.tmp")
     try:
         with writing(path):
+            _check_held(path.parent)
             with open(temporary, "wb") as file:
-                file.write(data)
+                yield file
                 file.flush()
-                os.fsync(file.fileno())
+                _sync(file.fileno())
+            _check_held(path.parent)
             os.replace(temporary, path)
             _sync_directory(path.parent)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Replace ``path`` by ``data`` atomically, with a mode by the umask; else StorageError."""
+    with replacing(path) as file:
+        file.write(data)
+
+
+def append(path: Path, data: bytes, *, durable: bool = False) -> None:
+    """Add ``data`` to ``path``, flushed to the disk if ``durable``; else StorageError."""
+    with writing(path):
+        _check_held(path.parent)
+        with open(path, "ab") as file:
+            file.write(data)
+            file.flush()
+            if durable:
+                _sync(file.fileno())
 
 
 def target(path: Path) -> Path:
@@ -70,7 +93,7 @@ def target(path: Path) -> Path:
 
 def write_text(path: Path, text: str) -> None:
     """Replace ``path`` by UTF-8 ``text`` atomically; else StorageError."""
-    write_bytes(path, text.encode())
+    write_bytes(path, encoded(text))
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -83,14 +106,22 @@ def canonical_json(value: Any) -> str:
     return _dumps(value, separators=(",", ":"))
 
 
-_dumps = functools.partial(json.dumps, sort_keys=True, allow_nan=False, ensure_ascii=False)
+def encoded(text: str) -> bytes:
+    """Return UTF-8; bytes of a path that are none are escapes, which JSON reads back."""
+    return text.encode(errors="backslashreplace")
+
+
+def _dumps(value: Any, **layout: Any) -> str:
+    text = json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, **layout)
+    return encoded(text).decode()
 
 
 def parse_json(text: str | bytes) -> dict[str, Any]:
     """Parse a JSON object strictly: a NaN or a duplicate key is a ValueError."""
     try:
         value = json.loads(text, object_pairs_hook=_unique_keys)
-        canonical_json(value).encode()  # refuses NaN, infinities and lone surrogates
+        text = json.dumps(value, allow_nan=False, ensure_ascii=False)  # no NaN, no infinity
+        text.encode(errors="surrogateescape")  # no lone surrogates, but bytes of a path
     except RecursionError:
         raise ValueError("nested too deeply") from None
     if not isinstance(value, dict):
@@ -125,7 +156,7 @@ def read_bytes(path: Path, *, limit: int | None = None) -> bytes:
         DataError: larger than ``limit``, or not a regular file.
         StorageError: the disk refused.
     """
-    try:
+    with reading(path):
         if not path.is_file():
             if path.exists():
                 raise DataError(f"{path} is not a regular file")
@@ -134,6 +165,13 @@ def read_bytes(path: Path, *, limit: int | None = None) -> bytes:
         if limit is not None and size > limit:
             raise DataError(f"{path} is too large: {size} bytes, at most {limit} are accepted")
         return path.read_bytes()
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn every OSError inside the ``with`` block into a StorageError."""
+    try:
+        yield
     except OSError as error:
         raise StorageError(f"cannot read {path}: {error.strerror or error}") from None
 
@@ -142,13 +180,17 @@ def make_durable(path: Path) -> None:
     """Flush to the disk what was appended to ``path``, if it is there."""
     with writing(path), contextlib.suppress(FileNotFoundError):
         with open(path, "rb") as file:
-            os.fsync(file.fileno())
+            _sync(file.fileno())
         _sync_directory(path.parent)
 
 
 def jsonable(value: Any) -> Any:
     """Return ``value`` as plain JSON data: numpy becomes lists, undefined numbers become null."""
-    return msgspec.json.decode(msgspec.json.encode(value, enc_hook=_plain))
+    try:
+        return msgspec.json.decode(msgspec.json.encode(value, enc_hook=_plain))
+    except UnicodeEncodeError:  # a path that is not UTF-8
+        text = json.dumps(msgspec.to_builtins(value, enc_hook=_plain, str_keys=True))
+        return json.loads(text, parse_constant=lambda name: None)
 
 
 def _plain(value: Any) -> Any:
@@ -189,20 +231,52 @@ def list_names(directory: Path) -> list[str]:
 class _Lock(io.FileIO):
     """It says who holds it, and nothing once given back: directories do not show who made them."""
 
-    held = False
+    _directory: str | None = None
+
+    def hold(self, directory: Path) -> None:
+        """Remember which directory this is, and keep its inode from being given to another."""
+        self._directory, self._handle = os.path.abspath(directory), os.open(directory, os.O_RDONLY)
+        _HELD[self._directory] = os.fstat(self._handle).st_ino, self._handle
 
     def close(self) -> None:
-        if self.held and not self.closed:
+        if self._directory is not None and not self.closed:
             with contextlib.suppress(OSError):
                 self.truncate(0)
+            _HELD.pop(self._directory, None)
+            os.close(self._handle)
         super().close()
+
+
+# Directories that are locked here, with their inodes and handles, or for us: then without.
+_HELD: dict[str, tuple[int, int | None]] = {}
+
+
+def _check_held(directory: Path) -> None:
+    """Raise StorageError where another directory is in the place of one that is locked here."""
+    inode, handle = _HELD.get(os.path.abspath(directory), (None, None))
+    if inode is None:
+        return
+    with contextlib.suppress(FileNotFoundError):
+        if directory.stat().st_ino == inode:
+            return
+    hint = "put it back, then run the same command again"
+    with contextlib.suppress(OSError):  # Linux knows where it is now
+        now = os.readlink(f"/proc/self/fd/{handle}")
+        hint = errors.shell(["hjepa", "resume", now])
+        hint = "choose another place with --out DIR" if now.endswith(" (deleted)") else hint
+    raise StorageError(
+        f"{directory} is not the directory that this run began in: that was moved or deleted",
+        hint=hint,
+    )
 
 
 def lock_directory(directory: Path) -> IO[bytes]:
     """Take ``directory`` for this process alone, until the returned file is closed.
 
     Also proves that the directory is writable and sweeps temporaries of processes that died. The
-    lock is the kernel's and ends with its holder; the text in the file is for people.
+    lock is the kernel's and ends with its holder; the text in the file is for people. Until then
+    nothing is written to another directory that comes to be in its place. Where the file system
+    has no locks an :class:`~hjepa_cli.errors.Unlocked` warning says so.
 
     Raises:
         LockedError: another process holds it.
@@ -221,15 +295,42 @@ def lock_directory(directory: Path) -> IO[bytes]:
                 + (f": {found[0].decode()}" if found else ""),
                 hint="wait until it has ended, or choose another place with --out DIR",
             ) from None
-        except OSError:
-            file.close()
-            raise
-    file.held = True
+        except OSError as error:
+            if error.errno not in _UNSUPPORTED:
+                file.close()
+                raise
+            warnings.warn(
+                f"{directory} cannot be locked on this file system: run nothing else in it",
+                errors.Unlocked,
+                stacklevel=2,
+            )
+        file.hold(directory)
     with contextlib.suppress(OSError):  # a full disk does not unlock the directory
         file.truncate(0)  # what a killed holder has left
         file.write(f"process {os.getpid()} on {platform.node()}".encode())
     sweep_temporaries(directory)
     return file
+
+
+def identity(directory: Path) -> tuple[str, int]:
+    """Return what tells a directory from another that is put in its place, and to whom it does."""
+    inode, _ = _HELD.get(os.path.abspath(directory), (None, None))  # once it was locked, for good
+    return platform.node(), directory.stat().st_ino if inode is None else inode
+
+
+@contextlib.contextmanager
+def holding(directory: Path, which: tuple[str, int]) -> Iterator[None]:
+    """Write to ``directory`` only while it is the one of this :func:`identity`, in a worker."""
+    node, inode = which
+    if node != platform.node():  # disks over a network may number files for each machine
+        yield
+        return
+    before = _HELD.get(key := os.path.abspath(directory))
+    _HELD[key] = before if before is not None and before[0] == inode else (inode, None)
+    try:
+        yield
+    finally:
+        _HELD.pop(key, None) if before is None else _HELD.update({key: before})
 
 
 @contextlib.contextmanager
@@ -314,11 +415,24 @@ def _refuse_special(path: Path, kinds: Mapping[int, str] = _SPECIAL) -> None:
             )
 
 
+# What file systems answer that have no locks, or cannot flush a directory.
+_UNSUPPORTED = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.ENOSYS}
+
+
+def _sync(handle: int) -> None:
+    """Flush to the disk; some file systems do not have that, which is no reason to stop."""
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in _UNSUPPORTED:
+            raise
+
+
 def _sync_directory(directory: Path) -> None:
     """Make a rename durable: the new name is an entry of the directory, not of the file."""
     handle = os.open(directory, os.O_RDONLY)
     try:
-        os.fsync(handle)
+        _sync(handle)
     finally:
         os.close(handle)
 

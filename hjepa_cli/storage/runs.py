@@ -13,7 +13,6 @@ import io
 import json
 import os
 import platform
-import shlex
 import sys
 import time
 import tomllib
@@ -21,12 +20,21 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any, Self
 
+import msgspec
+
 from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.compute.versions import TRAINED_WITH, versions
 from hjepa_cli.config.schema import Settings, dotted
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.errors import DataError, Interrupted, MissingInputError, UsageError
+from hjepa_cli.errors import (
+    DataError,
+    HjepaError,
+    Interrupted,
+    MissingInputError,
+    UsageError,
+    shell,
+)
 from hjepa_cli.plugins import Source, in_force
 from hjepa_cli.storage import files, seals, tracking
 
@@ -36,6 +44,8 @@ ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
 EVENTS = "events.jsonl"
 RESULT = "result.json"
+SMOKE = "smoke"  # the preset that shows that all of it runs, too small to learn
+LAST_EVENTS_BYTES = 4096
 ASKED = ("remeasure", "verify")  # flags that are work, which a finished run has done or has not
 
 SCHEMA = 3  # of environment.json; 1 had neither a schema nor inputs, 2 no settings
@@ -230,28 +240,56 @@ class Run:
         self.event("started")
 
     def _append(self, name: str, text: str) -> None:
-        path = self.path(name)
-        with files.writing(path), open(path, "a", encoding="utf-8", newline="") as file:
-            file.write(text)
+        files.append(self.path(name), files.encoded(text))
 
 
 def newest_run(
-    stage: str, predicate: Callable[[Path], bool] = lambda directory: True
+    stage: str,
+    predicate: Callable[[Path], bool] = lambda directory: True,
+    *,
+    preset: str | None = SMOKE,
 ) -> Path | None:
-    """Return the newest finished ``runs/<stage>/*`` that is not damaged and fits."""
-    for directory in finished_runs(stage):
+    """Return the newest finished ``runs/<stage>/*`` that is not damaged and fits.
+
+    Those of preset smoke have learned nothing: only who works with that ``preset`` gets them.
+    """
+    for directory in finished_runs(stage, preset=preset):
         with contextlib.suppress(DataError, MissingInputError, LookupError, TypeError):
             if predicate(directory):
                 return directory
     return None
 
 
-def finished_runs(*stages: str) -> list[Path]:
-    """Return the finished ``runs/<stage>/*`` of some stages, newest first."""
+def finished_runs(*stages: str, preset: str | None = SMOKE) -> list[Path]:
+    """Return the finished ``runs/<stage>/*`` of some stages, newest first.
+
+    Those of preset smoke are left out, unless ``preset`` is that.
+    """
     places = (ROOT / stage for stage in stages)
     every = (place / name for place in places for name in files.list_names(place))
-    finished = (directory for directory in every if (directory / RESULT).is_file())
-    return sorted(finished, key=lambda one: ((one / RESULT).stat().st_mtime_ns, one), reverse=True)
+    finished = [directory for directory in every if (directory / RESULT).is_file()]
+    if preset != SMOKE:
+        finished = [directory for directory in finished if not is_smoke(directory)]
+    return sorted(finished, key=lambda one: (_ended_s(one), one), reverse=True)
+
+
+def is_smoke(directory: Path) -> bool:
+    """Return whether a run was of preset smoke; a damaged record does not say so."""
+    with contextlib.suppress(HjepaError):
+        return read_environment(directory).get("preset") == SMOKE
+    return False
+
+
+def _ended_s(directory: Path) -> float:
+    """Return when a run wrote of itself last: copying and checking out change a file's time."""
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        with open(directory / EVENTS, "rb") as file:
+            file.seek(max(os.path.getsize(directory / EVENTS) - LAST_EVENTS_BYTES, 0))
+            *_, last = file.read().splitlines()
+        time_s = json.loads(last)["time"]
+        if isinstance(time_s, float | int) and 0 < time_s < time.time() + 86_400:
+            return float(time_s)
+    return (directory / RESULT).stat().st_mtime
 
 
 def read_result(directory: Path) -> dict[str, Any]:
@@ -265,7 +303,7 @@ def read_result(directory: Path) -> dict[str, Any]:
         DataError: damaged, or changed after it was written.
     """
     path, environment = directory / RESULT, read_environment(directory)
-    again = f"run it again: hjepa {environment['stage']} --config {directory / CONFIG}"
+    again = f"run it again: {anew(environment, directory / CONFIG)}"
     result = seals.read(path, RESULT_SCHEMA, again)
     if seals.SEAL not in result:
         if environment["schema"] == SCHEMA:
@@ -283,9 +321,10 @@ def read_result(directory: Path) -> dict[str, Any]:
 
 
 def _tables(directory: Path) -> dict[str, str]:
-    """Return the sha256 of each table of a run by name."""
-    tables = (path for path in directory.glob("*.csv") if path.is_file())
-    return {path.name: hashlib.sha256(files.read_bytes(path)).hexdigest() for path in tables}
+    """Return the sha256 of each table of a run, and of its other records, by name."""
+    records = (directory / CONFIG, directory / ENVIRONMENT)
+    found = (path for path in (*directory.glob("*.csv"), *records) if path.is_file())
+    return {path.name: hashlib.sha256(files.read_bytes(path)).hexdigest() for path in found}
 
 
 def read_config(directory: Path) -> dict[str, Any]:
@@ -296,7 +335,8 @@ def read_config(directory: Path) -> dict[str, Any]:
     """
     path = directory / CONFIG
     try:
-        found = tomllib.loads(files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode())
+        text = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode("utf-8-sig")
+        found = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid TOML: {error}") from None
     if (directory / ENVIRONMENT).exists():
@@ -304,8 +344,7 @@ def read_config(directory: Path) -> dict[str, Any]:
         if recorded["schema"] == SCHEMA and (changed := differences(recorded["settings"], found)):
             raise DataError(
                 f"{path} was changed after the run was begun: {'; '.join(changed)}",
-                hint=f"put it back, or for a run with it: hjepa {recorded['stage']} "
-                f"--config {path} --out DIR",
+                hint=f"put it back, or for a run with it: {anew(recorded, path)} --out DIR",
             )
     return found
 
@@ -326,16 +365,39 @@ def read_environment(directory: Path) -> dict[str, Any]:
         files.check_schema(schema, SCHEMA, f"run {directory}")
     if schema == 1:
         recorded["inputs"] = {}
-    plugins = recorded.setdefault("plugins", [])
-    named = isinstance(plugins, list) and all(
-        isinstance(one, dict) and all(isinstance(one.get(key), str) for key in ("name", "sha256"))
-        for one in plugins
-    )
-    stage, inputs, settings = (recorded.get(key) for key in ("stage", "inputs", "settings"))
-    known = isinstance(settings, dict) or recorded["schema"] < SCHEMA
-    if not (named and known and isinstance(stage, str) and isinstance(inputs, dict)):
-        raise DataError(f"{path} lacks fields or has malformed ones")
+    recorded.setdefault("plugins", [])
+    try:
+        msgspec.convert(recorded, _Environment)
+    except msgspec.ValidationError as error:
+        raise DataError(f"{path} lacks fields or has malformed ones: {error}") from None
+    if schema == SCHEMA and "settings" not in recorded:
+        raise DataError(f"{path} lacks fields or has malformed ones: no `settings`")
     return recorded
+
+
+class _Named(msgspec.Struct):
+    name: str
+    sha256: str
+
+
+class _Input(msgspec.Struct):
+    path: str
+    sha256: str
+
+
+class _Environment(msgspec.Struct):
+    """It is all of ``environment.json`` that is relied on, or shown."""
+
+    stage: str
+    inputs: dict[str, _Input | bool | int | float | str | list[Any] | None]
+    plugins: list[_Named]
+    preset: str | None = None
+    settings: dict[str, Any] = {}
+    command: list[str] = []
+    versions: dict[str, str | None] = {}
+    system: str | None = None
+    machine: str | None = None
+    cpus: int | None = None
 
 
 def check_plugins(directory: Path, recorded: Mapping[str, Any]) -> None:
@@ -344,21 +406,38 @@ def check_plugins(directory: Path, recorded: Mapping[str, Any]) -> None:
     begun_with = [Source(one["name"], one["sha256"]) for one in recorded["plugins"]]
     for plugin in begun_with:
         if plugin.sha256 not in now:
-            why = "has changed since" if plugin.name in now.values() else "is not in force"
-            install = f"pip install {plugin.name.replace(' ', '==')}"
+            why, hint = "is not in force", continue_command(directory, begun_with)
+            if plugin.installed:
+                hint = f"pip install {plugin.name.replace(' ', '==')}"
+            elif plugin.name in now.values():
+                why, again = "has changed since", anew(recorded, directory / CONFIG)
+                hint = f"restore the file, or begin anew: {again} --out DIR"
             raise UsageError(
-                f"{directory} was begun with plugin {plugin.name}, which {why}",
-                hint=install if plugin.installed else continue_command(directory, begun_with),
+                f"{directory} was begun with plugin {plugin.name}, which {why}", hint=hint
             )
 
 
 def continue_command(directory: Path, plugins: Iterable[Source] | None = None) -> str:
     """Return what takes a run up again, with its plugins, or those that are in force now."""
-    words = ["resume", str(directory)]
-    for source in in_force() if plugins is None else plugins:
-        if not source.installed:
-            words += ["--plugin", source.name]
-    return f"{torchrun.program()} {shlex.join(words)}"
+    words = ["resume", str(directory), *_named(in_force() if plugins is None else plugins)]
+    return f"{torchrun.program()} {shell(words)}"
+
+
+def anew(recorded: Mapping[str, Any], config: Path | None = None) -> str:
+    """Return the command of a recorded run: its settings in a file, its plugins and inputs."""
+    words = [recorded["stage"], *(["--config", str(config)] if config else [])]
+    words += _named(Source(one["name"], one["sha256"]) for one in recorded["plugins"])
+    for name, value in recorded["inputs"].items():
+        flag = f"--{name.replace('_', '-')}"
+        if value is True:
+            words.append(flag)
+        elif isinstance(value, Mapping) and " " not in name:  # of several models the first
+            words += [flag, str(value.get("path"))]
+    return f"hjepa {shell(words)}"
+
+
+def _named(plugins: Iterable[Source]) -> list[str]:
+    return [word for one in plugins if not one.installed for word in ("--plugin", one.name)]
 
 
 def version_of(recorded: Mapping[str, Any]) -> str | None:

@@ -7,7 +7,6 @@ file that its line describes, bit for bit; that it exists proves nothing.
 
 import dataclasses
 import hashlib
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -81,10 +80,7 @@ class ShardLog:
 
     def add(self, described: Described) -> None:
         """Record a finished shard: ``name``, ``sha256`` and whatever else the manifest needs."""
-        with files.writing(self._path), open(self._path, "ab") as file:
-            file.write(_line(described))
-            file.flush()
-            os.fsync(file.fileno())
+        files.append(self._path, _line(described), durable=True)
         self.done[described["name"]] = described
 
 

@@ -4,6 +4,7 @@ safetensors 0.8 silently scrambles arrays that are not C-contiguous, and more th
 key makes the bytes random. All array files of this program therefore pass through here.
 """
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -68,6 +69,28 @@ def unpack(data: bytes, path: Path) -> tuple[dict[str, np.ndarray], str | None]:
     except _MALFORMED as error:
         reason = str(error).partition("\n")[0]
         raise DataError(f"{path} is damaged or not a safetensors file: {reason}") from None
+
+
+def check_header(path: Path) -> None:
+    """Read no more of a file than says whether it can be one of tensors, however large it is.
+
+    Raises:
+        DataError: it cannot be one.
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as file:
+        begun, size = file.read(8), os.fstat(file.fileno()).st_size
+        length = int.from_bytes(begun, "little")
+        if length > min(HEADER_LIMIT_BYTES, size - 8):
+            unpack(begun + file.read(len(_LFS_POINTER)), path)  # says so
+        try:
+            header = parse_json(file.read(length))
+            ends = [e["data_offsets"][1] for name, e in header.items() if name != "__metadata__"]
+            if 8 + length + max(ends, default=0) != size:
+                raise ValueError("its tensors do not fill it")
+        except _MALFORMED as error:
+            reason = str(error).partition("\n")[0]
+            raise DataError(f"{path} is damaged or not a safetensors file: {reason}") from None
 
 
 def plain_array(array: np.ndarray, name: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, shell
 from hjepa_cli.storage import files, runs, seals
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 
@@ -99,7 +99,8 @@ def verify_model(name_or_path: str | Path) -> ZooModel:
     checkpoint = load_checkpoint(path)
     curves = path.with_name(CURVES_FILE)
     if curves.exists():
-        again = f"measure it again: hjepa eval --checkpoint {name_or_path} --remeasure"
+        command = shell(["hjepa", "eval", "--checkpoint", name_or_path, "--remeasure"])
+        again = f"measure it again: {command}"
         document = seals.read(curves, CURVES_SCHEMA, again)
         digest = document.get("digest")
         if not isinstance(digest, dict) or digest.get("checkpoint") != checkpoint.digest:

@@ -11,7 +11,7 @@ import secrets
 import stat
 from pathlib import Path
 
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, shell
 from hjepa_cli.storage import files
 from hjepa_cli.wire.protocol import TAG_BYTES
 
@@ -49,14 +49,18 @@ def read_key(path: Path) -> bytes:
     if mode & 0o077:
         raise DataError(
             f"key file {path} has mode {mode:04o}: others may read or change it",
-            hint=f"chmod 600 {path}; if others have had the time to read it, make a new one",
+            hint=f"{shell(['chmod', 600, path])}; if others have had time to read it, make a new one",
         )
     if len(data) < KEY_BYTES[0]:
         raise DataError(
             f"key file {path} has {len(data)} bytes; a key has at least {KEY_BYTES[0]}",
-            hint=f"rm {path}; hjepa serve --key {path} makes a new one",
+            hint=f"{shell(['rm', path])}; a new one is made by: {_made_by(path)}",
         )
     return data
+
+
+def _made_by(path: Path) -> str:
+    return shell(["hjepa", "serve", "--model", "DIR", "--key", path])
 
 
 def make_key(path: Path) -> bytes:
@@ -86,7 +90,7 @@ def key_of(path: Path | None, *, make: bool = False) -> bytes:
     except MissingInputError:
         raise MissingInputError(
             f"key file {path} does not exist",
-            hint=f"copy the server's, which hjepa serve --key {path} makes, and keep its mode",
+            hint=f"copy the server's and keep its mode; it is made by: {_made_by(path)}",
         ) from None
 
 

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, shell
 from hjepa_cli.storage import files
 
 SCHEMA = 1
@@ -99,7 +99,12 @@ def files_of(name: str) -> tuple[str, str]:
 
 
 def _again(bundle: Bundle) -> str:
-    return f"copy the bundle again, or hjepa export MODEL --to {bundle.directory}"
+    return f"copy the bundle again, or: {exported_by(bundle.directory)}"
+
+
+def exported_by(directory: Path) -> str:
+    """Return the command that writes a bundle."""
+    return shell(["hjepa", "export", "MODEL", "--to", directory])
 
 
 def open_bundle(directory: Path) -> Bundle:
@@ -112,7 +117,7 @@ def open_bundle(directory: Path) -> Bundle:
     path = directory / MANIFEST
     if not path.is_file():
         raise MissingInputError(
-            f"{directory} holds no exported model", hint=f"hjepa export MODEL --to {directory}"
+            f"{directory} holds no exported model", hint=exported_by(directory)
         )
     data = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES)
     try:

@@ -75,7 +75,7 @@ class Drive:
             if time.monotonic() >= until_s and not self._device.connected:
                 raise Unavailable(
                     f"no answer from {written(self._server)} within {wait_s:g} s",
-                    hint="is hjepa serve running there, with the same --key FILE?",
+                    hint="does a server run there, with the same --key? start one: hjepa serve --model DIR",
                 )
 
     def run(self, steps: int | None, stop_after_s: float | None) -> None:
@@ -165,7 +165,7 @@ class Drive:
             since = f"for {silent_s:.3g} s" if self._device.silent < protocol.NO_STEP else "so far"
             raise Unavailable(
                 f"no forces from {written(self._server)} {since}, and {what}: stopped at 0 N",
-                hint="hjepa serve; then start the device again",
+                hint="start the server, then the device again: hjepa serve --model DIR",
             )
 
     def _send(self, data: bytes | None) -> None:

@@ -32,9 +32,10 @@ from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import hold, plan_stride
 from hjepa_cli.core.networks.model import Model, load_modules
+from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, NumericalError, UsageError, require
+from hjepa_cli.errors import DataError, NumericalError, UsageError, choices, require, shell
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage import files
 from hjepa_cli.storage.checkpoints import load_checkpoint
@@ -53,6 +54,7 @@ from hjepa_cli.wire.runtime import Runtime
 CALIBRATION, CHECKED = 512, 256  # frame pairs, of trajectories 0 … and of held-out ones
 FLOAT_CONVOLUTIONS = 7  # of the int8 encoder: the stem, and three of each of two stages
 LARGEST_ERROR = 1e-5  # of z, and of forces ÷ limit, against torch
+NOT_EXPORTED = ("linear", "hjepa-fused")  # plan with more than the networks of a bundle
 OURS = {MANIFEST, CHECK, *(file for name in NETWORKS for file in files_of(name))}
 Inputs = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Shape of a row and type of each input, by name."""
@@ -144,7 +146,7 @@ def exported_method(model: Model, method: str | None) -> str:
     able = [
         name
         for name in methods_of(model)
-        if getattr(METHODS[name], "planner", None) and name != "linear"
+        if getattr(METHODS[name], "planner", None) and name not in NOT_EXPORTED
     ]
     if not able:
         raise UsageError(
@@ -153,7 +155,7 @@ def exported_method(model: Model, method: str | None) -> str:
             hint="hjepa models list; a hierarchy or a predictor of train-hierarchy can be exported",
         )
     if method is not None and method not in able:
-        raise UsageError(f"this model cannot be exported as '{method}'; choose {', '.join(able)}")
+        raise UsageError(f"this model cannot be exported as '{method}'; {choices(method, able)}")
     return method or able[0]
 
 
@@ -345,7 +347,8 @@ def _quiet() -> Iterator[None]:
 def pictures(model: Model, split: str, count: int) -> Pixels:
     """Return frames uint8 [count, κ, 64, 128, 3] of trajectories as the model was trained on."""
     collect = msgspec.convert(model.metadata["settings"]["collect"], CollectSettings)
-    settings = Settings(plant=model.plant_name, collect=collect)
+    control = control_of(model.metadata["settings"], "the model")
+    settings = Settings(plant=model.plant_name, collect=collect, control=control)
     rows = max(1, min(32, getattr(collect, _SIZES[split])))
     states = generate(settings, split, range(rows)).states.astype(np.float64)
     ends = np.arange(model.frames, states.shape[1] + 1)
@@ -373,7 +376,7 @@ def check(bundle: Bundle, path: Path, backend: str = "onnxruntime") -> dict[str,
     if model.digest != bundle.manifest["checkpoint"]["sha256"]:
         raise DataError(
             f"{bundle.directory} was exported from another checkpoint than {path}",
-            hint=f"hjepa export {path} --to {bundle.directory}",
+            hint=shell(["hjepa", "export", path, "--to", bundle.directory]),
         )
     bundle.verify()
     planner, runtime = planner_of(model, method), Runtime(bundle, backend)

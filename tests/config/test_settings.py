@@ -1,16 +1,18 @@
 """Settings: default < preset < config < flags, with every mistake named."""
 
 import dataclasses
+import json
 import re
 import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from hjepa_cli.config.checks import check_settings
-from hjepa_cli.config.schema import PAPER_PROTOCOL, Settings, declared, dotted
+from hjepa_cli.config.checks import check_settings, resolve
+from hjepa_cli.config.schema import PAPER_PROTOCOL, RadioSettings, Settings, declared, dotted
 from hjepa_cli.config.settings import PRESETS, load_settings, origins
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.stages.train_encoder import ARCHITECTURE
@@ -27,6 +29,7 @@ def test_every_preset_loads_and_says_what_it_is(preset: str) -> None:
     settings = load_settings(preset)
     assert settings.preset == preset
     changes = {} if preset == "default" else dotted(preset_file(preset))
+    changes = {key: value for key, value in changes.items() if value != []}  # as by default
     paper = {key: changes.pop(key) for key in list(changes) if key.startswith("protocol.paper.")}
     expected = dotted(Settings().as_dict()) | changes | {"preset": preset}
     assert dotted(settings.as_dict()) == expected
@@ -112,7 +115,7 @@ def test_loading_twice_is_independent() -> None:
         ("[radio]\ncarrier_ghz = 0.1", "expected a finite number from 0.5 to 100"),
         ("[actor]\ndropout = 1.0", "expected a finite number of at least 0 and less than 1"),
         ("[encoder]\ngate = 1", r"encoder\.gate = 1 in .*; expected true or false"),
-        ('device = "tpu"', "device = 'tpu' in .*, line 1; choose one of auto, cpu, cuda"),
+        ('device = "tpu"', "device = 'tpu' in .*, line 1; .*choose one of auto, cpu, cuda"),
         ("[protocol]\ngaps = 3", "expected a list"),
         ('[protocol]\ngaps = [1, "2"]', r"protocol\.gaps\[1\] = '2' in .*, line 2; expected a who"),
         ("[protocol]\nsteps = 1\n[protocol.noise]\na = 1", "'protocol.noise'.* line 3 is a value"),
@@ -123,6 +126,33 @@ def test_mistakes_in_a_config_are_named(tmp_path: Path, text: str, match: str) -
     with pytest.raises(UsageError, match=match) as caught:
         load_settings(config=tmp_path / "c.toml")
     assert "\n" not in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ('methods = ["oracel"]', r"'oracel' in .*, line 1; did you mean 'oracle'. choose from hje"),
+        ("methods = []", "no method given in .*, line 1; choose from hjepa"),
+        ('[radio]\nschedulers = ["round-robbin"]', "line 2; did you mean 'round-robin'"),
+        ("[radio]\nschedulers = []", "no scheduler given in .*, line 2; choose from round-robin"),
+        ('[radio]\nlaw = "sheduled"', "radio.law = 'sheduled' in .*, line 2; did you mean 'sched"),
+        ('plant = "deskop"', "plant = 'deskop' in .*, line 1; did you mean 'desktop'"),
+        ('[encoder]\nmirror = "exat"', r"line 2; did you mean 'exact'. choose one of exact, aug"),
+        ('[protocol]\npayload = "int99"', "unknown payload 'int99' in .*, line 2; choose float32"),
+        ('[protocol]\npayload = "flot16"', r"line 2; did you mean 'float16'. choose float32"),
+        ("[protocol]\ngaps = []", r"protocol.gaps = \[\] in .*, line 2; expected ascending"),
+        ("[hierarchy]\nm = 3", "--m 3 does not divide --h 4 in .*, line 2; choose --m from 1"),
+        ("[encoder]\nframes = 7", "--frames 7 in .*, line 2; method jepa takes 2"),
+        ('plant = "quadrotor"\n[conditions]\npole_length = 2', "pole_length = 2 in .*, line 3; "),
+    ],
+)
+def test_rules_name_the_file_the_line_and_the_nearest_name(
+    tmp_path: Path, text: str, match: str
+) -> None:
+    (tmp_path / "c.toml").write_text(text)
+    with pytest.raises(UsageError, match=match) as caught:
+        resolve(None, tmp_path / "c.toml", {"plant": None})
+    assert str(caught.value) == caught.value.message and "\n" not in caught.value.message
 
 
 @pytest.mark.parametrize(
@@ -147,12 +177,63 @@ def test_values_from_python_meet_the_same_bounds() -> None:
         ("protocol", {"steps": 0}, "protocol.steps = 0; expected a whole number"),
         ("protocol", {"gaps": (1, 0)}, r"protocol.gaps\[1\] = 0; expected a whole number"),
         ("radio", {"harq_rounds": 17}, "radio.harq_rounds = 17; expected .* from 1 to 16"),
-        ("encoder", {"mirror": "no"}, "encoder.mirror = 'no'; choose one of exact, augment, none"),
+        ("encoder", {"mirror": "no"}, "encoder.mirror = 'no'; .*one of exact, augment, none"),
         ("actor", {"dropout": float("nan")}, "actor.dropout = nan; expected a finite number"),
     ):
         changed = dataclasses.replace(getattr(settings, section), **changes)
         with pytest.raises(UsageError, match=message):
             check_settings(dataclasses.replace(settings, **{section: changed}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"plant": "nope"}, "plant = 'nope'; choose one of desktop"),
+        ({"radio": RadioSettings(law="equale")}, "radio.law = 'equale'; did you mean 'equal'"),
+        ({"protocol": None}, "protocol = None; expected a section"),
+    ],
+)
+def test_settings_made_in_python_meet_the_rules_of_names(changes: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        check_settings(dataclasses.replace(load_settings(), **changes))
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    flags = {
+        "radio.bandwidth_hz": np.float64(5e6),
+        "protocol.steps": np.int64(500),
+        "protocol.gaps": np.array([1, 5]),
+        "encoder.gate": np.bool_(False),
+    }
+    settings = load_settings(flags=flags)
+    assert type(settings.radio.bandwidth_hz) is float and settings.protocol.gaps == (1, 5)
+    assert type(settings.protocol.steps) is int and settings.encoder.gate is False
+    changed = dataclasses.replace(settings.protocol, steps=np.int64(500), gaps=np.array([1, 5]))
+    changed = dataclasses.replace(settings, protocol=changed)
+    check_settings(changed)
+    assert json.dumps(changed.as_dict()) == json.dumps(settings.as_dict())
+    with pytest.raises(UsageError, match=r"protocol\.steps = 1\.5; expected a whole number"):
+        load_settings(flags={"protocol.steps": np.float32(1.5)})
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({5: 5}, "unknown setting 5; expected a dotted key"),
+        ({"protocol.steps.x": 5}, "'protocol.steps' is a value, not a section"),
+        ({"protocol.": 5}, "unknown setting 'protocol.'"),
+        ({"collect": 5}, "'collect' is a section, not a value"),
+    ],
+)
+def test_flags_from_python_that_are_none(flags: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        load_settings(flags=flags)
+
+
+def test_a_config_may_be_named_by_a_text(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text("seed = 5\n")
+    assert load_settings(config=str(tmp_path / "c.toml")).seed == 5
+    assert origins(config=str(tmp_path / "c.toml"))["seed"] == str(tmp_path / "c.toml")
 
 
 def test_whole_numbers_serve_as_floats(tmp_path: Path) -> None:
@@ -173,7 +254,7 @@ def test_config_files_that_are_none(tmp_path: Path) -> None:
 
 
 def test_unknown_preset_and_flag() -> None:
-    with pytest.raises(UsageError, match="unknown preset 'papper'; choose one of default, gym"):
+    with pytest.raises(UsageError, match=r"'papper'; did you mean 'paper'. choose .* default, gym"):
         load_settings("papper")
     with pytest.raises(UsageError, match=r"unknown setting .collect\.stepz.; did you mean"):
         load_settings(flags={"collect.stepz": 3})

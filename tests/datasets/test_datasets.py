@@ -381,6 +381,14 @@ def test_open_directory_refuses_what_is_not_ours(tmp_path: Path) -> None:
         pass
 
 
+def test_the_newest_of_numbered_datasets_has_the_highest_number(tmp_path: Path) -> None:
+    for number in (1, 2, 10000):
+        write(tmp_path / f"desktop-{number:04d}")
+        os.utime(tmp_path / f"desktop-{number:04d}" / MANIFEST, (900 - number % 10, 900))
+    os.utime(tmp_path / "desktop-0001" / MANIFEST, (2000, 2000))  # copied, or touched
+    assert find_newest_dataset(tmp_path) == tmp_path / "desktop-10000"
+
+
 def test_newest_dataset_of_a_plant(tmp_path: Path) -> None:
     assert find_newest_dataset(tmp_path / "data", "desktop") is None
     for age, (name, plant) in enumerate(

@@ -158,7 +158,7 @@ def test_labels_are_what_the_teacher_does_where_the_window_shows(
         stride=3,
         mirror=mirror,
         shift_px=2,
-        labels=labels_of(split, kind),
+        labels=labels_of(split, kind, kind.teacher()),
     )
     batch = windows.draw(16, np.random.default_rng(2))
     assert batch.labels is not None

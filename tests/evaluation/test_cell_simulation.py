@@ -126,6 +126,14 @@ def test_a_block_for_everybody_is_a_perfect_link(scheduler):
     assert np.array_equal(ours.score, theirs.score[0])
 
 
+@pytest.mark.parametrize("name", ["hold-true", "oracle"])
+def test_a_late_link_is_late_in_the_cell_as_it_is_alone(name):
+    link = {"delay_steps": 9, "jitter_steps": 3, "downlink_loss": 0.2}
+    ours = cell(name, 9, access(blocks=9), **link)
+    assert np.array_equal(ours.cost, given(name, every_step(300, 9), **link).cost[0])
+    assert not np.array_equal(ours.cost, cell(name, 9, access(blocks=9)).cost)
+
+
 def test_age_based_schedulers_without_fading_are_round_robin():
     scores = [cell("oracle", 30, access(name)).score for name in ("max-aoi", "whittle")]
     assert np.array_equal(scores[0], scores[1])

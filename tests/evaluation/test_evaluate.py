@@ -186,6 +186,34 @@ def test_eval_measures_every_method_and_says_what_it_found(
         assert result["methods"][name]["score"] == 1
 
 
+def test_eval_says_what_the_link_was_and_counts_its_bits(
+    checkpoint: Path, quick_encoder: None
+) -> None:
+    methods = ("hjepa", "linear", "state-kf", "hold", "local", "optimal")
+    late = small(methods=methods, delay_steps=5, jitter_steps=2, downlink_loss=0.2)
+    few = dataclasses.replace(late.collect, trajectories=4, test_trajectories=2, steps=12)
+    late = dataclasses.replace(late, collect=few)
+    result = evaluate.run(late, Output().screen, checkpoint=str(checkpoint))
+    assert result["link"] == {
+        "delay_steps": 5,
+        "jitter_steps": 2,
+        "downlink_loss": 0.2,
+        "confirmation_bits": 48,
+    }
+    bits = {name: entry["bits_per_transmission"] for name, entry in result["methods"].items()}
+    sent = {name: 2064 + 48 for name in methods[:4]}
+    assert bits == {**sent, "local": 0, "optimal": None}
+    assert result["methods"]["optimal"]["score"] == 1.0
+    plain = dataclasses.replace(late, protocol=small(methods=methods).protocol)
+    ideal = evaluate.run(plain, Output().screen, checkpoint=str(checkpoint))
+    assert ideal["link"]["confirmation_bits"] == 0 and not ideal["link"]["delay_steps"]
+    for name in ("local", "optimal"):  # on the device
+        assert ideal["methods"][name]["score"] == result["methods"][name]["score"]
+    for name in methods[:4]:
+        assert ideal["methods"][name]["bits_per_transmission"] == 2064
+        assert ideal["methods"][name]["gap_curve"] != result["methods"][name]["gap_curve"]
+
+
 def test_eval_is_deterministic_and_cached_by_digest(checkpoint: Path, quick_encoder: None) -> None:
     settings = small(methods=("hjepa", "oracle"))
     first = evaluate.run(settings, Output().screen, checkpoint=str(checkpoint))
@@ -336,7 +364,7 @@ def test_bad_requests_are_refused_before_anything_is_written(
     checkpoint: Path, tmp_path: Path
 ) -> None:
     screen = Output().screen
-    with pytest.raises(UsageError, match="unknown method 'hjepaa'; choose from hjepa, "):
+    with pytest.raises(UsageError, match=r"'hjepaa'; did you mean 'hjepa'. choose from hjepa, "):
         evaluate.run(small(methods=("hjepaa",)), screen, checkpoint=str(checkpoint))
     with pytest.raises(MissingInputError, match="nowhere"):
         evaluate.run(small(), screen, checkpoint="nowhere")

@@ -11,8 +11,8 @@ from command_line import assert_one_line_error, open_shell
 from test_evaluate import untrained
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.core.control.controllers import StrideController
-from hjepa_cli.core.control.loop import Draws, every_step, simulate
+from hjepa_cli.core.control.controllers import LastForce, StrideController
+from hjepa_cli.core.control.loop import Draws, LinkDraws, every_step, simulate
 from hjepa_cli.core.control.methods.true_state import true_state_driver
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
@@ -135,6 +135,44 @@ def test_a_periodic_link_loses_nothing(checkpoint):
     assert not link.sends_always and (link.snr_db == 10).all()
 
 
+def test_a_late_link_shows_packets_when_they_arrive(checkpoint):
+    """Sent every 80 steps and 30 late: the newest is 30 to 109 steps old, at first none."""
+    late = {"protocol": "paper", "protocol.steps": 200, "protocol.delay_steps": 30}
+    model = Model.load(checkpoint, "cpu")
+    link = make_link(load_settings(flags=late), model, 2, 10.0, 0.5, 80)
+    assert np.flatnonzero(link.sent[:, 0]).tolist() == [0, 80, 160]
+    assert np.flatnonzero(link.delivered[:, 0]).tolist() == [30, 110, 190]
+    expected = [-1] * 30 + [30 + k for k in range(80)] + [30 + k for k in range(80)]
+    assert link.age_steps[:190, 0].tolist() == expected
+    assert link.late == ", packets 30 steps late"
+    states = np.zeros((200, 2, 4))
+    film = Film("hjepa", states, states, np.ones((200, 2), bool))
+    kind = plant("desktop")
+    shots = animation.Pictures([film], link, kind, kind.camera(), 10)
+    assert [shots.age(0, k) for k in (29, 30, 109)] == [
+        *("no packet", "packet 30 ms old", "packet 109 ms old"),
+    ]
+    shots.draw(0)
+
+
+def test_a_believer_passes_on_what_is_planned_and_asks_nobody_for_an_age_who_takes_none():
+    """Forces over a lossy downlink, with late packets, are those without a believer."""
+    kind, late = plant("desktop"), {"protocol.delay_steps": 5, "protocol.downlink_loss": 0.4}
+    settings = load_settings(flags={"protocol": "paper", "protocol.steps": 80, **late})
+    draws = Draws.make(settings.protocol, 2, 0)
+    read = lambda seen: torch.from_numpy(seen[:, -1]).float()  # noqa: E731
+    act = lambda z: z @ torch.tensor([3.0, 5.0, 40.0, 4.0])  # noqa: E731
+
+    def forces(wrap):
+        seen, controller = [], wrap(LastForce(act, 2, tau_steps=8.0))
+        watch = lambda k, states, forces_n: seen.append(forces_n.copy())  # noqa: E731
+        simulate(kind, draws, every_step(80, 2)[None], controller, read, watch=watch)
+        return np.stack(seen)
+
+    probe = torch.zeros(5, 4).double()
+    assert np.array_equal(forces(lambda one: Believer(one, probe)), forces(lambda one: one))
+
+
 # --- pictures
 
 
@@ -143,7 +181,8 @@ def pictures(steps=300, devices=2, every=10):
     random = np.random.default_rng(0)
     delivered = random.random((steps, devices)) < 0.1
     delivered[0] = True
-    link = Link(delivered, random.normal(20, 3, (steps, devices)), True, "made up")
+    snr_db = random.normal(20, 3, (steps, devices))
+    link = Link(delivered, snr_db, True, "made up", LinkDraws())
     states = np.zeros((steps, devices, 4))
     states[..., 0] = 0.02
     states[..., 2] = 0.1
@@ -159,7 +198,7 @@ def test_age_counts_from_the_last_arrival():
         age = 0
         for k, arrived in enumerate(shots.link.delivered[:, device]):
             age = 0 if arrived else age + 1
-            assert shots.age_steps(device, k) == age
+            assert shots.link.age_steps[k, device] == age
 
 
 def test_the_strip_shows_every_slot_of_the_last_while():

@@ -184,3 +184,22 @@ def test_manifest_is_plain_data_that_fixes_the_picture():
 def test_an_unknown_plant_names_the_choices():
     with pytest.raises(UsageError, match=r"moon.*desktop, gym"):
         Camera("moon")
+
+
+@pytest.mark.parametrize(
+    ("states", "shape"),
+    [([[0, 0, 0]], r"\(1, 3\)"), ([0, 0, 0, 0], r"\(4,\)"), (0, r"\(\)"), ([[[0] * 4]], r"\(1, 1")],
+    ids=str,
+)
+def test_states_of_another_shape_are_refused(states, shape):
+    with pytest.raises(ValueError, match=rf"states: shape {shape}.*, not \(n, 4\): x, x_dot"):
+        Camera("desktop").render(states)
+    with pytest.raises(ValueError, match=r"state: shape \(1, 3\), not \(4,\)"):
+        Camera("desktop").sketch_px([[0, 0, 0]])
+
+
+@pytest.mark.parametrize("far", [1e308, -1e308, 1e5])
+def test_a_cart_that_is_far_away_is_not_seen(far):
+    """And nothing overflows, which would be a warning, and so an error here."""
+    seen = CAMERAS["desktop"].render([[far, far, 0, far], [0.0, 0, far, 0]])
+    assert (seen[0] == 255).all() and (seen[1] != 255).any()

@@ -107,25 +107,99 @@
 | 32 | NaN in a state or noise of a public cart-pole | test_not_finite.py::test_one_cart_pole_stays_as_it_was |
 | 32 | NaN in what equations and teachers are asked | test_not_finite.py::test_equations_and_teachers_answer_no_garbage |
 | 32 | NaN in what a model is asked | test_not_finite.py::test_a_model_answers_no_garbage |
+| 33 | results that do not get out | test_streams.py::test_results_that_do_not_get_out_are_one_line_and_74 |
+| 33 | an error that cannot be told | test_streams.py::test_an_error_keeps_its_code_where_it_cannot_be_told |
+| 33 | streams closed at the start | test_streams.py::test_a_closed_stream_is_the_null_device |
+| 33 | streams that are None | test_streams.py::test_streams_that_are_none_are_the_null_device |
+| 33 | a file in the place of a stream | test_streams.py::test_no_file_of_ours_is_what_a_closed_stream_was |
+| 33 | a full log disk during a run | test_streams.py::test_a_run_survives_a_full_log_disk |
+| 34 | a launcher's variable missing or wrong | test_launcher.py::test_a_variable_that_is_wrong_is_named |
+| 34 | a process that never comes | test_launcher.py::test_a_peer_that_never_comes_is_waited_for_aloud_and_interruptibly |
+| 34 | a launcher's port taken | test_launcher.py::test_a_port_that_is_taken_is_named |
+| 35 | a directory moved under a run | test_odd_disks.py::test_a_run_whose_directory_was_moved_writes_into_no_other |
+| 35 | the same, deleted | test_odd_disks.py::test_a_deleted_directory_is_not_made_again |
+| 35 | two collections in one place | test_odd_disks.py::test_two_collections_one_in_the_place_of_the_other_do_not_mix |
+| 35 | a worker's directory moved | test_odd_disks.py::test_a_worker_writes_into_the_directory_that_was_locked |
+| 36 | memory runs out | test_memory.py::test_running_out_of_memory_is_no_error_to_report |
+| 36 | sizes beyond the memory | test_memory.py::test_sizes_beyond_the_memory_are_refused_before_any_work |
+| 36 | sizes beyond all machines | test_memory.py::test_sizes_have_upper_bounds |
+| 36 | a dataset beyond the memory | test_memory.py::test_a_training_beyond_the_memory_is_refused |
+| 36 | a split beyond the memory | test_memory.py::test_an_export_beyond_the_memory_is_refused |
+| 36 | an export that is held whole | test_memory.py::test_an_export_takes_no_more_memory_for_more_trajectories |
+| 37 | a disk without locks | test_odd_disks.py::test_a_disk_without_locks_is_said_and_used |
+| 37 | a disk that flushes no directories | test_odd_disks.py::test_a_disk_that_cannot_flush_directories_is_used |
+| 37 | a system without semaphores | test_odd_disks.py::test_without_semaphores_there_is_one_process |
+| 38 | paths that are no UTF-8 | test_paths.py::test_any_bytes_are_a_path_wherever_one_is_written |
+| 38 | a locale of few characters | test_paths.py::test_a_locale_of_few_characters_is_enough |
+| 39 | a hint that fails in its turn | test_hints.py::test_a_hint_that_cannot_be_followed_is_noticed |
+| 40 | results of others, or damaged | test_foreign_records.py::test_a_result_that_is_none_of_its_stage_is_refused |
+| 40 | records of others, or damaged | test_foreign_records.py::test_surroundings_that_are_none_are_refused |
+| 40 | a digit changed in any record of a run | test_foreign_records.py::test_a_digit_changed_in_any_record_of_a_finished_run_is_noticed |
+| 40 | one damaged shard that hides others | test_foreign_records.py::test_one_damaged_shard_does_not_hide_the_others |
+| 41 | data in which nothing moves | test_degenerate.py::test_data_in_which_nothing_moves_are_refused_at_the_start |
+| 41 | data in which nothing is seen to move | test_degenerate.py::test_movements_that_no_camera_sees_are_refused_before_training |
+| 41 | a measure that is undefined | test_degenerate.py::test_what_is_undefined_is_none |
+| 42 | a cluster's address that is silent | test_strange_clusters.py::test_a_listener_that_is_no_scheduler_is_soon_refused |
+| 42 | a scheduler's file of another program | test_strange_clusters.py::test_a_file_that_no_scheduler_wrote_is_refused |
+| 43 | a dry run that promises too much | test_small_things.py::test_a_dry_run_refuses_what_the_command_would |
+| 43 | conditions beyond all things | test_small_things.py::test_sizes_of_conditions_are_those_of_things |
+| 44 | arrays of other layouts | test_outside.py::test_any_memory_layout_is_read_right |
+| 44 | empty arrays | test_outside.py::test_an_empty_batch_has_no_embeddings |
+| 44 | pictures of other types and shapes | test_outside.py::test_other_pictures_are_refused_with_what_they_are |
+| 44 | embeddings of other types and shapes | test_outside.py::test_other_embeddings_are_refused |
+| 44 | states of other types and shapes | test_outside.py::test_other_states_are_refused_by_teachers_and_cart_poles |
+| 44 | links of other types and shapes | test_outside.py::test_the_radio_refuses_what_is_no_array_or_does_not_go_together |
+| 45 | an environment that cannot be made again | test_gym_copies.py::test_an_environment_is_made_again_from_its_spec |
+| 45 | an environment that cannot be copied | test_gym_copies.py::test_a_copy_goes_on_where_the_original_is |
+| 46 | a model of preset smoke as the newest | test_smoke.py::test_a_smoke_model_is_nobody_s_default |
+| 46 | the newest by the time of a file | test_runs.py::test_newest_run_is_finished_and_fits |
+| 47 | largest values beyond the last code | test_integers.py::test_no_value_is_off_by_more_than_half_a_step |
+| 48 | a second Ctrl-C, and the end of a terminal | test_interrupts.py::test_a_signal_is_one_line_and_a_second_one_ends_at_once |
+| 48 | a signal that is ignored from outside | test_interrupts.py::test_nohup_is_respected |
+| 48 | a directory that is read-only | test_bad_input.py::test_a_read_only_directory_is_refused_to_everybody |
+| 48 | a large file of another program | test_small_things.py::test_a_large_foreign_file_is_not_read_beyond_its_header |
+| 48 | figures that overwrite each other | test_small_things.py::test_figures_of_two_runs_of_a_stage_have_two_names |
+| 48 | a notebook's variables | test_small_things.py::test_a_notebook_s_backend_does_not_matter |
+| 48 | nobody within reach | test_small_things.py::test_a_hall_that_covers_few_says_so |
 """
 
-import ast
 import re
 from pathlib import Path
 
 import pytest
+from test_benchmarks import load
 
 ROWS = re.findall(r"^\| (\d+) \| (.+?) \| (test_\w+\.py)::(test_\w+) \|$", __doc__, flags=re.M)
-FAULTS = 32  # kinds: 24 that have happened to others, then those found by trying
+FAULTS = 48  # kinds: 24 that have happened to others, then those found by trying
+GUARDS = load("guards")
 
 
 @pytest.mark.parametrize(("kind", "fault", "file", "test"), ROWS)
 def test_every_fault_has_its_test(kind: str, fault: str, file: str, test: str) -> None:
+    """It is there, it is not skipped, and ``benchmarks/guards.py`` can take its guard away."""
     (path,) = Path(__file__).parents[1].rglob(file)
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    assert test in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    text = path.read_text(encoding="utf-8")
+    before, found, _ = text.partition(f"\ndef {test}(")
+    assert found, f"{file} has no {test}"
+    decorators = before[before.rindex("\n\n") :]
+    assert not re.search(r"mark\.skip|xfail", decorators)
+    assert GUARDS.stale(f"{file}::{test}") is None
 
 
 def test_the_table_is_read() -> None:
     assert len(ROWS) == __doc__.count("::")
     assert {int(kind) for kind, *_ in ROWS} == set(range(1, FAULTS + 1))
+    assert [(fault, f"{file}::{test}") for _, fault, file, test in ROWS] == GUARDS.rows()
+    assert GUARDS.GUARDS.keys() == {f"{file}::{test}" for _, _, file, test in ROWS}
+
+
+def test_a_test_without_teeth_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its guard gone, it still passes; and with the guard that matters gone it fails."""
+    test = "test_security.py::test_dependencies_are_few_and_bounded"
+    files = [path for path in GUARDS.tracked() if path.suffix in (".py", ".toml")]
+    assert not GUARDS.survives(test, files)
+    harmless = ("../pyproject.toml", 'readme = "README.md"', 'readme = "LICENSE"')
+    monkeypatch.setitem(GUARDS.GUARDS, test, (harmless,))
+    assert GUARDS.survives(test, files)
+    monkeypatch.setitem(GUARDS.GUARDS, test, (("errors.py", "no such text", ""),))
+    assert "0 times" in str(GUARDS.stale(test))

@@ -163,7 +163,7 @@ from hjepa_cli.plugins import register
 
 def member(name):
     found = re.fullmatch("keep-([0-9]+)", name)
-    return found and Codec(name, bits=lambda embedding: int(found[1]), fit=None)
+    return found and Codec(name, bits=lambda embedding: int(found[1]), fit=print)
 
 register(CodecFamily("keep-N", member, "keep-N for the first N values"))
 """

@@ -43,7 +43,10 @@ def test_listing_stages_imports_nothing_heavy():
     done = subprocess.run(
         [sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=False
     )
-    pipeline = "collect train-encoder train-hierarchy train-reflex eval scale reproduce"
+    pipeline = (
+        "tune-law collect train-encoder train-hierarchy train-reflex train-fusion eval scale "
+        "reproduce"
+    )
     assert (done.returncode, done.stdout) == (0, f"{pipeline}\n"), done.stderr
 
 
@@ -81,6 +84,7 @@ def test_a_stage_of_a_plugin_is_resumed_with_what_it_was_given(square, shell):
 
 
 def test_a_run_of_a_stage_that_is_not_there_is_named(square, shell, monkeypatch):
+    """What is missing is its plugin, as long as that may be; then the stage."""
     Path("stop").touch()
     Path("three").write_text("3")
     with pytest.raises(Interrupted):
@@ -89,3 +93,5 @@ def test_a_run_of_a_stage_that_is_not_there_is_named(square, shell, monkeypatch)
         )
     monkeypatch.setattr(STAGES, "_added", {})
     assert_one_line_error(shell("resume", "r"), 65, "'square'")
+    monkeypatch.setattr(plugins, "_sources", [])
+    assert_one_line_error(shell("resume", "r"), 2, "hint: hjepa resume r --plugin square.py")

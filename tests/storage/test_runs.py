@@ -262,10 +262,10 @@ def test_a_second_process_is_locked_out() -> None:
 
 def test_newest_run_is_finished_and_fits() -> None:
     assert newest_run("train-encoder") is None
-    for age, (name, plant) in enumerate([("a", "gym"), ("b", "desktop"), ("c", "gym")]):
+    for age, (name, plant) in enumerate([("c", "gym"), ("b", "desktop"), ("a", "gym")]):
         with Run.create("train-encoder", Path("runs/train-encoder") / name, SETTINGS) as run:
             run.finish({"plant": plant})
-        os.utime(run.path(runs.RESULT), (100 - age, 100 - age))  # a is the newest
+        os.utime(run.path(runs.RESULT), (100 - age, 100 - age))  # as copying may leave them
     with Run.create("train-encoder", None, SETTINGS):
         pass  # unfinished
     assert newest_run("train-encoder") == Path("runs/train-encoder/a")
@@ -273,6 +273,28 @@ def test_newest_run_is_finished_and_fits() -> None:
     assert newest_run("train-encoder", is_desktop) == Path("runs/train-encoder/b")
     assert newest_run("train-encoder", lambda _: False) is None
     assert newest_run("eval") is None
+
+
+def test_a_run_without_a_time_of_its_own_has_that_of_its_file() -> None:
+    for name, events in (("a", ""), ("b", "no json\n"), ("c", '{"time": "late"}\n')):
+        with Run.create("train-encoder", Path("runs/train-encoder") / name, SETTINGS) as run:
+            run.finish({})
+        os.utime(run.path(runs.RESULT), (200 - ord(name), 200 - ord(name)))  # a is the newest
+        run.path(runs.EVENTS).write_text(events)
+    assert newest_run("train-encoder") == Path("runs/train-encoder/a")
+
+
+def test_runs_of_preset_smoke_are_nobody_s_newest() -> None:
+    """They have learned nothing; who works with that preset wants them."""
+    for name, preset in (("trained", "default"), ("smoked", "smoke")):
+        settings = load_settings(preset).as_dict()
+        with Run.create("train-encoder", Path("runs/train-encoder") / name, settings) as run:
+            run.finish({})
+    trained, smoked = (Path("runs/train-encoder") / name for name in ("trained", "smoked"))
+    assert newest_run("train-encoder", preset="default") == trained
+    assert newest_run("train-encoder", preset="smoke") == smoked
+    assert runs.finished_runs("train-encoder", preset="gym") == [trained]
+    assert runs.finished_runs("train-encoder", preset="smoke") == [smoked, trained]
 
 
 def test_a_result_is_written_after_all_else_is_on_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -327,7 +349,6 @@ def test_a_damaged_run_does_not_hide_the_others() -> None:
     for name in ("a", "b", "c"):
         with Run.create("train-encoder", Path("runs/train-encoder") / name, SETTINGS) as run:
             run.finish({})
-        os.utime(run.path(runs.RESULT), (ord(name), ord(name)))  # c is the newest
     Path("runs/train-encoder/c/config.toml").write_text("= 3")
     Path("runs/train-encoder/b/config.toml").unlink()
     plant = lambda directory: read_config(directory)["plant"] == "desktop"  # noqa: E731

@@ -661,7 +661,9 @@ def test_a_run_of_another_version_says_so(hjepa: Shell) -> None:
     Path("r/config.toml").write_text(known + "\n[quantum]\nleap = 1\n")
     with hjepa.untouched():
         outcome = hjepa("resume", "r")
-    assert_one_line_error(outcome, 2, "made by hjepa 9.8.7", "quantum", "hjepa eval --out DIR")
+    assert_one_line_error(
+        outcome, 2, "made by hjepa 9.8.7", "quantum", "anew: hjepa eval --checkpoint"
+    )
     Path("r/config.toml").write_text(known)
     Path("r/environment.json").write_text(json.dumps(environment))
     outcome = hjepa("resume", "r")

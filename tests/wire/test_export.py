@@ -138,11 +138,25 @@ def test_models_that_plan_nothing_and_other_directories_are_refused(tmp_path):
 
     with pytest.raises(UsageError, match="plans no strides"):
         export(zoo.resolve_model("desktop-reflex"), tmp_path / "new", None)
-    with pytest.raises(UsageError, match="choose hjepa"):
+    with pytest.raises(UsageError, match="choose from hjepa"):
         export(zoo.resolve_model("desktop-h4m2l1"), tmp_path / "new", "oracle")
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(UsageError, match=r"letter\.txt"):
         export(zoo.resolve_model("desktop-h4m2l1"), tmp_path, None)
+
+
+def test_a_model_that_corrects_by_packets_is_exported_without_that():
+    """A bundle has no posterior: as ``hjepa-fused`` it would drive as another method."""
+    from hjepa_cli.core.control import drivers
+    from hjepa_cli.storage import zoo
+    from hjepa_cli.wire import export
+
+    model = export.load_fp32(zoo.resolve_model("desktop-h4m2l1"))
+    model.architecture["fusion"] = True
+    assert "hjepa-fused" in drivers.methods_of(model)
+    assert export.exported_method(model, None) == "hjepa"
+    with pytest.raises(UsageError, match="cannot be exported as 'hjepa-fused'"):
+        export.exported_method(model, "hjepa-fused")
 
 
 def test_lockstep_is_the_simulator(exported):

@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats, Integers
-from hjepa_cli.core.control.link import AHEAD_STEPS, SentForces
+from hjepa_cli.core.control.link import AHEAD_STEPS, REMEMBERED_STEPS, SentForces
 from hjepa_cli.core.networks.planning import Planner, Reaction
-
-REMEMBERED_STEPS = 512  # of forces that were sent: no packet may be later
+from hjepa_cli.errors import UsageError
 
 
 class _Strides:
@@ -103,6 +102,12 @@ class StrideController(_Strides):
         """Move late packets on to the present."""
         if ages is None or not ages.any():
             return packets
+        if not hasattr(self._planner, "follow"):  # of a plugin
+            raise UsageError(
+                f"packets come late, and {type(self._planner).__name__} cannot move an embedding "
+                "on under given forces: it has no follow(z, forces_n, ages)",
+                hint="write one (docs/plugins.md), or leave out --delay-steps and --jitter-steps",
+            )
         forces_n = self._sent.since(np.flatnonzero(delivered), ages)
         return self._planner.follow(packets, torch.from_numpy(forces_n).float(), ages)
 
@@ -128,6 +133,57 @@ class StrideController(_Strides):
             lead to, and the share of each stride that is over [n], 0 where one has just started.
         """
         return self._starts, self._z, (self._phase - 1) / self._stride
+
+
+class FusingController(StrideController):
+    """Plays a planner from what packets make of its own predictions: a filter in latent space.
+
+    Args:
+        planner: what it predicts and plays with.
+        devices: n.
+        correct: maps predicted embeddings and those of packets [m, D] to what is taken for true.
+        action_shape: A, of the plant.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        devices: int,
+        *,
+        correct: Callable[[Tensor, Tensor], Tensor],
+        action_shape: tuple[int, ...] = (),
+    ) -> None:
+        super().__init__(planner, devices, action_shape=action_shape)
+        self._correct, self._anchors = correct, self._z
+        self._anchor_ages = np.zeros(devices, dtype=np.int64)
+
+    def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
+        """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D]."""
+        if ages is None:  # the forces that were sent are remembered for packets on time, too
+            ages = np.zeros(int(delivered.sum()), dtype=np.int64)
+        played = super().act(delivered, packets, ages)
+        self._anchor_ages += 1
+        return played
+
+    def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
+        """Correct what was predicted for the moment of each packet, then move on to the present."""
+        assert ages is not None
+        if not self._anchors.shape[1]:
+            self._anchors = packets.new_zeros(len(delivered), packets.shape[1])
+        rows, predicted = np.flatnonzero(delivered), packets.clone()
+        known = self._heard[rows] & (self._anchor_ages[rows] <= REMEMBERED_STEPS)
+        if known.any():
+            old, at = rows[known], torch.from_numpy(rows[known])
+            if ages.any():
+                since = self._anchor_ages[old]
+                forces_n = torch.from_numpy(self._sent.since(old, since)).float()
+                moved = self._planner.follow(self._anchors[at], forces_n, since - ages[known])
+            else:  # the stride that is being played leads there
+                moved = self._planner.follow(self._starts[at], self._forces_n[at], self._phase[old])
+            predicted[torch.from_numpy(known)] = moved
+        corrected = self._correct(predicted, packets)
+        self._anchors[torch.from_numpy(rows)], self._anchor_ages[rows] = corrected, ages
+        return super()._take(delivered, corrected, ages)
 
 
 class ReflexController(_Strides):
@@ -172,7 +228,8 @@ class LastForce:
     """Acts on each packet, then keeps that force, lets it fade, or applies none.
 
     At age j it plays clip(s · C(packet) · e^(−j/τ)). With the teacher as actor and a packet at
-    every step this is the optimal controller.
+    every step this is the optimal controller. A late packet is taken for fresh: who predicts
+    nothing knows nothing better.
 
     Args:
         actor: packets [m, ...] → forces_n [m, *A].
@@ -204,11 +261,8 @@ class LastForce:
         self._played_n = self._forces_n = np.zeros((devices, *action_shape))
 
     @torch.inference_mode()
-    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
-        """Return the forces of one step [n, *A]; 0 N before a device's first packet.
-
-        Whatever their ages, packets are taken for fresh: it cannot know better.
-        """
+    def act(self, delivered: Bools, packets: Any) -> Floats:
+        """Return the forces of one step [n, *A]; 0 N before a device's first packet."""
         if packets is not None:
             forces_n = self._actor(packets)
             fresh_n = forces_n.float().cpu().numpy() if isinstance(forces_n, Tensor) else forces_n

@@ -16,14 +16,15 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.codecs.codec import Coder
 from hjepa_cli.core.control.controllers import LastForce
 from hjepa_cli.core.control.disagreement import TwoLevels
-from hjepa_cli.core.control.loop import Controller, Sensor
+from hjepa_cli.core.control.link import confirmation_bits
+from hjepa_cli.core.control.loop import Controller, Draws, Sensor
 from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, UsageError, choices
 from hjepa_cli.plugins import CODECS, METHODS
 
 
@@ -37,7 +38,8 @@ class Driver:
         controller: builds a fresh controller for n devices.
         reactive: builds one that only acts on packets, for links that deliver at every step.
         bits_per_transmission: what a transmission costs.
-        family: drivers of one family play the same when a packet arrives at every step.
+        family: drivers of one family play the same when a packet arrives at every step; over a
+            link that is not ideal each is a family of its own.
         uses_link: whether the method needs one.
         two_levels: builds the controller with a second level beside it, where the method has two.
         delay_steps: how long its packets are under way.
@@ -52,6 +54,10 @@ class Driver:
     uses_link: bool = True
     two_levels: Callable[[int], TwoLevels] | None = None
     delay_steps: int = 0
+
+    def draws(self, draws: Draws) -> Draws:
+        """Return the draws that its loops meet: one that sits on the device has no link."""
+        return draws if self.uses_link else draws.on_device
 
 
 def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
@@ -70,9 +76,16 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
     if METHODS[name].needs_model and (model is None or name not in methods_of(model)):
         raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")
     driver: Driver = METHODS[name].build(settings, model)
-    return dataclasses.replace(
-        driver, name=late(name, steps), family=late(driver.family, steps), delay_steps=steps
+    if not driver.uses_link:
+        return dataclasses.replace(driver, name=late(name, steps))
+    told = confirmation_bits(settings.protocol, len(plant(settings.plant).force_signs))
+    bits = driver.bits_per_transmission + told
+    driver = dataclasses.replace(
+        driver, name=late(name, steps), delay_steps=steps, bits_per_transmission=bits
     )
+    if steps or not settings.protocol.ideal_link:  # a packet at every step leaves much to predict
+        driver = dataclasses.replace(driver, reactive=driver.controller, family=driver.name)
+    return driver
 
 
 def embedding_driver(
@@ -132,6 +145,6 @@ def planner_of(model: Model, method: str) -> Planner:
     """
     planners = {name: made for name in methods_of(model) if (made := METHODS[name].planner)}
     if method not in planners:
-        raise UsageError(f"this model has no planner '{method}'; choose from {', '.join(planners)}")
+        raise UsageError(f"this model has no planner '{method}'; {choices(method, planners)}")
     planner: Planner = planners[method](model)
     return planner

@@ -1,17 +1,45 @@
 """A link may be late in both directions, out of order, and lose forces on their way back.
 
-What it loses on the way up is the schedule's, :mod:`hjepa_cli.core.control.loop`.
+What it loses on the way up is the schedule's, :mod:`hjepa_cli.core.control.loop`. A delay is that
+from a packet's capture to the step whose force answers it, so the way back is in it.
 """
 
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hjepa_cli.config.schema import IDEAL_LINK, ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 
 AHEAD_STEPS = 16  # forces in a datagram at most: its step's, and those of the next ones
+REMEMBERED_STEPS = 512  # in which controllers know what they sent: no packet may be later
+STEP_BITS = FORCE_BITS = 16  # step numbers start again after 65,536
+
+
+def confirmation_bits(protocol: ProtocolSettings, forces: int) -> int:
+    """Return the bits by which a packet is longer where the link is not ideal.
+
+    The controller has to know when the packet was captured, and what had been played by then: so it
+    tells its step, the last forces applied and the step of the datagram that they came from.
+    """
+    return 0 if protocol.ideal_link else 2 * STEP_BITS + forces * FORCE_BITS
+
+
+def facts(protocol: ProtocolSettings, forces: int) -> dict[str, float]:
+    """Return what ``eval --json`` and ``scale --json`` say of the link."""
+    known = {key: getattr(protocol, key) for key in IDEAL_LINK}
+    return known | {"confirmation_bits": confirmation_bits(protocol, forces)}
+
+
+def described(link: Mapping[str, float]) -> str:
+    """Say in words, each part after a comma, in what the link of :func:`facts` is not ideal."""
+    delay, jitter, loss = (link.get(key, 0) for key in IDEAL_LINK)
+    steps = f"{delay} to {delay + jitter}" if jitter else f"{delay}"
+    late = f", packets {steps} steps late" if delay or jitter else ""
+    return late + (f", {100 * loss:g} % of the forces lost" if loss else "")
 
 
 class InFlight:

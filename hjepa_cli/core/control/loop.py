@@ -17,16 +17,18 @@ import inspect
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
-from hjepa_cli.core.arrays import Bools, Floats, Integers
-from hjepa_cli.core.control.link import Downlink, InFlight
+from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
 from hjepa_cli.core.plants.system import System
@@ -41,13 +43,13 @@ GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples, modulo 1, spread evenly howeve
 class Controller(Protocol):
     """Is the remote side, which has no way to the plant: packets come in, forces go out."""
 
-    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
+    def act(self, delivered: Bools, packets: Any) -> Floats:
         """Return the forces of one step in newton [n, *A].
 
         Of the devices ``delivered`` [n] packets arrive, which carry ``packets``
-        [delivered.sum(), ...]; ``None`` when there are none. Where the link may be late, at every
-        step of it, ``ages`` [delivered.sum()] tells how many steps ago each was sensed. A
-        controller that has no such argument takes them all for fresh.
+        [delivered.sum(), ...]; ``None`` when there are none. A controller that has a third argument
+        ``ages``, integers [delivered.sum()] or by default ``None``, is told at every step of a link
+        that may be late how many steps ago each packet was sensed. Another takes them for fresh.
 
         One that has ``ahead_n()``, too, tells devices the forces [n, L, *A] of this step and of the
         next ones without a packet; of others a device holds the last force that reaches it.
@@ -61,6 +63,12 @@ Sensor = Callable[[Floats], Any]
 Those before a device was switched on are copies of its first; see
 :func:`~hjepa_cli.core.plants.frames.frames_seen`.
 """
+
+
+def check_memory(protocol: ProtocolSettings, devices: int) -> None:
+    """Raise OutOfMemory where the draws of a closed loop do not fit."""
+    values = protocol.total_steps * devices * (len(protocol.half_widths) + 1)
+    memory.check(16 * values, f"a loop of {devices} devices over {protocol.total_steps} steps")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +97,7 @@ class Draws:
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "Draws":
         """Draw for ``devices`` devices, all derived from ``seed``."""
+        check_memory(protocol, devices)
         states = len(protocol.half_widths)
         initial = np.empty((devices, states))
         noise = np.empty((protocol.total_steps, devices, states))
@@ -101,6 +110,11 @@ class Draws:
         noise *= noise_per_step(protocol)
         link = LinkDraws.make(protocol, devices, seed)
         return cls(initial, noise, delivery, mass_scale, protocol.warmup_steps, link)
+
+    @property
+    def on_device(self) -> "Draws":
+        """Return the same for controllers that sit on the device, where no link is in between."""
+        return dataclasses.replace(self, link=LinkDraws())
 
     @property
     def devices(self) -> int:
@@ -163,8 +177,18 @@ class LinkDraws:
         return LinkDraws(self.delay_steps, extra, lost)
 
     @property
+    def jitter_steps(self) -> int:
+        """Return the most that any packet takes besides."""
+        return 0 if self.extra_steps is None else int(self.extra_steps.max(initial=0))
+
+    @property
     def _drawn(self) -> tuple[Any, Any]:
         return self.extra_steps, self.lost
+
+
+def takes_ages(controller: Controller) -> bool:
+    """Return whether a controller wants to be told how old packets are."""
+    return "ages" in inspect.signature(controller.act).parameters
 
 
 class Link:
@@ -174,6 +198,9 @@ class Link:
         draws: of these devices.
         controller: drives them.
         delay_steps: what packets take besides, because they are long.
+
+    Raises:
+        UsageError: a packet may be later than the controller remembers what it sent.
     """
 
     def __init__(self, draws: LinkDraws, controller: Controller, delay_steps: int = 0) -> None:
@@ -182,15 +209,21 @@ class Link:
         self._in_flight = InFlight(delay_steps, draws.extra_steps)
         self._downlink = None if draws.lost is None else Downlink(draws.lost)
         self._controller = controller
-        self._told = self._late and "ages" in inspect.signature(controller.act).parameters
+        self._told = self._late and takes_ages(controller)
+        if self._told and (latest := delay_steps + draws.jitter_steps) > REMEMBERED_STEPS:
+            raise UsageError(
+                f"packets may come {latest} steps late; a controller remembers what it sent in the "
+                f"last {REMEMBERED_STEPS}",
+                hint=f"make delay and jitter {REMEMBERED_STEPS} steps or less together",
+            )
 
     def forces_n(self, sent: Bools, packets: Any) -> Floats:
         """Send the packets of one step; return the forces [n, *A] that devices play in it."""
         ages = None
         if self._late:
             sent, packets, ages = self._in_flight.pass_on(sent, packets)
-        told = (ages,) if self._told else ()
-        forces_n = self._controller.act(sent, packets, *told)
+        act: Any = self._controller.act
+        forces_n: Floats = act(sent, packets, ages) if self._told else act(sent, packets)
         if self._downlink is None:
             return forces_n
         ahead_n = getattr(self._controller, "ahead_n", lambda: forces_n[:, None])
@@ -236,7 +269,7 @@ def gap_schedule(gap_steps: float, steps: int, devices: int) -> Bools:
     Raises:
         UsageError: a gap D, whole or fractional, that is below 1 or infinite.
     """
-    if not 1 <= gap_steps < math.inf:
+    if not isinstance(gap_steps, Real) or not 1 <= gap_steps < math.inf:
         raise UsageError(f"gap of {gap_steps} steps; a gap is 1 step or longer, and finite")
     phases = gap_steps * np.fmod(np.arange(devices) * GOLDEN, 1.0)
     periods = np.arange(int(steps / gap_steps) + 1)
@@ -267,7 +300,7 @@ def delivery_schedule(probability: float, delivery: Floats) -> Bools:
     Raises:
         UsageError: p outside 0 … 1.
     """
-    if not 0 <= probability <= 1:
+    if not isinstance(probability, Real) or not 0 <= probability <= 1:
         raise UsageError(f"delivery probability {probability}; it lies between 0 and 1")
     schedule = delivery < probability
     schedule[0] = True

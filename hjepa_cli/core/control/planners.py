@@ -44,6 +44,15 @@ def follow(
     return z
 
 
+def corrected(posterior: nn.Module, predicted: Tensor, packets: Tensor) -> Tensor:
+    """Return where devices are [n, D], from where they were predicted to be and their packets.
+
+    The posterior is a predictor that is guided by the packet, over no time and under no force.
+    """
+    z: Tensor = posterior(predicted, predicted.new_zeros(len(predicted), 0), packets)
+    return z
+
+
 class Hierarchy:
     """Plans as H-JEPA: one coarse stride at a time, filled in by the finer levels."""
 
@@ -65,6 +74,12 @@ class Hierarchy:
                 recompute_waypoint=self._model.architecture["stride_actions"] == "all",
             )
         return self._model.force_limit_n * actions, z_next
+
+    def correct(self, predicted: Tensor, packets: Tensor) -> Tensor:
+        """Return where devices are [n, D], by the model's posterior: see :func:`corrected`."""
+        with self._model.autocast():
+            z = corrected(self._model.networks["posterior"], predicted, packets)
+        return z.to(packets.dtype)
 
     def follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:
         """Move embeddings on, by P^H in strides and by the predictor of stride 1 for the rest."""

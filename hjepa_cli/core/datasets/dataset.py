@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import hashlib
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -122,6 +123,15 @@ class Dataset:
         parts = [self._read_shard(shard, described["steps"]) for shard in described["shards"]]
         joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         return Trajectories(**joined)
+
+    def flaws(self) -> Iterator[HjepaError]:
+        """Yield what is wrong with each shard that is gone, unreadable or not as it was written."""
+        for split in self.splits.values():
+            for shard in split["shards"]:
+                try:
+                    self._read_shard(shard, split["steps"])
+                except HjepaError as error:
+                    yield error
 
     def _read_shard(self, shard: Mapping[str, Any], steps: int) -> dict[str, np.ndarray]:
         path = self.path / shard["name"]
@@ -261,12 +271,19 @@ def open_directory(out: Path | None, plant_name: str) -> Iterator[Path]:
 
 
 def find_newest_dataset(root: Path, plant_name: str | None = None) -> Path | None:
-    """Return the most recently finished dataset (of a plant) directly under ``root``, if any."""
-    found = []
-    for name in files.list_names(root):
+    """Return the most recently finished dataset (of a plant) directly under ``root``, if any.
+
+    Of those that we have numbered the number tells, whatever copying has made of their times.
+    """
+    found, latest = [], dict[str, int]()
+    for name in files.list_names(root):  # sorted, numbers from low to high
         with contextlib.suppress(HjepaError, OSError):
             load_dataset(root / name, plant_name)
-            found.append(((root / name / MANIFEST).stat().st_mtime_ns, name))
+            time_ns = (root / name / MANIFEST).stat().st_mtime_ns
+            if numbered := re.fullmatch(r"(.+)-\d{4,}", name):
+                series = numbered[1]
+                time_ns = latest[series] = max(time_ns, latest.get(series, 0))
+            found.append((time_ns, name))
     return root / max(found)[1] if found else None
 
 

@@ -13,6 +13,7 @@ trajectory holds what was seen and the action that led from there to row j + 1:
 
 import io
 import json
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 
 from hjepa_cli.core.datasets.dataset import Trajectories
 from hjepa_cli.errors import MissingInputError
-from hjepa_cli.storage.files import write_bytes
+from hjepa_cli.storage.files import replacing, write_bytes
 
 TOGETHER = 20  # trajectories rendered and written at a time
 
@@ -95,15 +96,26 @@ def write_npz(
     path: Path,
     values: dict[str, np.ndarray],
     pixels: Iterator[np.ndarray] | None,
+    frame_shape: tuple[int, ...],
     about: dict[str, Any],
 ) -> None:
     """Write the columns as one compressed NPZ file, atomically; equal data give equal bytes."""
-    arrays: dict[str, Any] = {"hjepa": np.array(json.dumps(about, sort_keys=True)), **values}
-    if pixels is not None:
-        arrays["pixels"] = np.concatenate(list(pixels))
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    write_bytes(path, buffer.getvalue())
+    arrays = {"hjepa": np.array(json.dumps(about, sort_keys=True)), **values}
+    with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+
+        def put(name: str, blocks: Iterator[np.ndarray], shape: tuple[int, ...]) -> None:
+            """Add an array block by block: frames are many times larger than the file."""
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                for number, block in enumerate(blocks):
+                    if number == 0:
+                        described = np.lib.format.header_data_from_array_1_0(block)
+                        np.lib.format.write_array_header_1_0(entry, {**described, "shape": shape})
+                    entry.write(np.ascontiguousarray(block).data)
+
+        for name, array in arrays.items():
+            put(name, iter([array]), array.shape)
+        if pixels is not None:
+            put("pixels", pixels, (len(values["state"]), *frame_shape))
 
 
 def blocks(split: Trajectories, frames: Frames, tick: Callable[[int], None]) -> Iterator[Any]:

@@ -154,13 +154,19 @@ class LoadSimulator(Simulator):
             teacher = self.driver("optimal")
             outcome = simulate(
                 self.plant,
-                Draws.make(protocol, count, seed),
+                teacher.draws(Draws.make(protocol, count, seed)),
                 every_step(protocol.total_steps, count)[None],
                 teacher.controller(count),
                 teacher.sensor,
             )
             known = self._teacher[seed] = outcome.score[0]
         return known[:devices]
+
+
+def hall_coverage(radio: RadioSettings, snr_db: float, seed: int, devices: int) -> float:
+    """Return the share of devices in a hall whose power suffices for an SNR at mean fading."""
+    margin_db, _ = _links(radio, snr_db, seed, devices)
+    return float(np.mean(np.asarray(margin_db) >= 0))
 
 
 def _links(

@@ -59,7 +59,7 @@ class Block:
         build = driver.reactive if self.reactive else driver.controller
         return simulate(
             simulator.plant,
-            draws.part(devices),
+            driver.draws(draws.part(devices)),
             schedules,
             build(loops),
             driver.sensor,

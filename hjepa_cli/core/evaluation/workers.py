@@ -27,6 +27,7 @@ from hjepa_cli.compute.executors import (
     open_cluster,
     placement,
     prepare_worker,
+    semaphores,
     spawning,
     worker_pool,
 )
@@ -234,7 +235,7 @@ def open_workers(unit_steps: int) -> Iterator[Workers]:
             with closing(Workers(executor, threads)) as workers:
                 yield workers
     elif count:
-        with spawning():  # its lock starts a process that keeps track of it
+        with spawning(), semaphores():  # its lock starts a process that keeps track of it
             done: Synchronized[int] = multiprocessing.get_context("spawn").Value("q", 0)
         counter = done.get_obj()
         with worker_pool(count, _start, done) as pool:

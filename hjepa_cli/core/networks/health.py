@@ -16,16 +16,18 @@ def probe_r2(
     test_z: Tensor,
     test_states: Tensor,
     names: Sequence[str],
-) -> dict[str, float]:
+) -> dict[str, float | None]:
     """Return the held-out R² of a linear least-squares probe from embeddings to each state.
 
     It is fitted on embeddings [N, D] and states [N, S] and tested on others; ``names`` are those
-    of the S states.
+    of the S states. Of a state that is the same everywhere there is none: ``None``.
     """
     truth = test_states.double()
     residual = truth - read_probe(fit_probe(train_z, train_states), test_z)
     r2 = 1.0 - residual.square().sum(0) / (truth - truth.mean(0)).square().sum(0)
-    return dict(zip(names, r2.tolist(), strict=True))
+    varies = (truth != truth[0]).any(0)
+    found = (value if known else None for value, known in zip(r2.tolist(), varies, strict=True))
+    return dict(zip(names, found, strict=True))
 
 
 def fit_probe(z: Tensor, states: Tensor) -> Tensor:
@@ -69,8 +71,13 @@ def action_sensitivity(
     return float(spread / (z_next - z).norm(dim=-1).mean().clamp_min(1e-12))
 
 
-def nrmse(predicted: Tensor, truth: Tensor) -> float:
-    """Return the root mean square error ÷ the root mean square of the truth, of equal shapes."""
+def nrmse(predicted: Tensor, truth: Tensor) -> float | None:
+    """Return the root mean square error ÷ the root mean square of the truth, of equal shapes.
+
+    Of a truth that is zero everywhere there is none: ``None``.
+    """
+    if not truth.any():
+        return None
     return float((predicted - truth).square().mean().sqrt() / truth.square().mean().sqrt())
 
 

@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hjepa_cli.compute.device import autocast, compute_dtype, resolve_device
-from hjepa_cli.core.arrays import finite
 from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
+from hjepa_cli.core.networks.outside import embeddings_from, frames_from
+from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
+from hjepa_cli.core.plants.frames import FRAME_SHAPE
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import same_camera
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
 
@@ -54,7 +56,7 @@ def build_modules(
     ``action_shape`` and ``force_signs`` are the plant's. By ``kind``:
 
     - ``encoder``: Ψ and its companion P^H;
-    - ``hierarchy``: Ψ, all levels, the flat baseline and the actor;
+    - ``hierarchy``: Ψ, all levels, the flat baseline and the actor, with ``fusion`` a posterior;
     - ``flat``: Ψ, a predictor of stride h, the one of stride 1 and the actor;
     - ``supervised``: Ψ, of κ frames, and the actor;
     - ``autoencoder``: Ψ, the decoder, a second Ψ that reads what was decoded, and the actor;
@@ -103,6 +105,10 @@ def build_modules(
             mirror=mirror,
         )
         modules.update({name: predictors[name] for name in levels_of(architecture)})
+    if architecture.get("fusion"):
+        modules["posterior"] = Predictor(
+            embedding, architecture["hidden"], 0, guided=True, mirror=mirror
+        )
     if kind == "autoencoder":
         modules["decoder"] = Decoder(embedding, frames, symmetric)
         modules["reader"] = encoder()
@@ -229,7 +235,7 @@ def encode_frames(
 ) -> Tensor:
     """Return embeddings [N, D], float32 on the CPU, of uint8 frames [N, κ, H, W, 3]."""
     parts = []
-    for start in range(0, len(frames), ENCODE_BATCH):
+    for start in range(0, max(len(frames), 1), ENCODE_BATCH):  # of no frames there is none, [0, D]
         batch = frames[start : start + ENCODE_BATCH].to(device)
         with autocast(device, precision):
             parts.append(encoder(batch).float().cpu())
@@ -280,7 +286,7 @@ class Model:
         if isinstance(architecture, dict) and architecture.get("kind") == "encoder":
             raise DataError(
                 f"{path} is a checkpoint of train-encoder, not of train-hierarchy",
-                hint=f"hjepa train-hierarchy --encoder {path}",
+                hint=shell(["hjepa", "train-hierarchy", "--encoder", path]),
             )
         return cls(load_modules(checkpoint), checkpoint.metadata, checkpoint.digest, device)
 
@@ -293,13 +299,12 @@ class Model:
         """Encode frames uint8 [N, κ, 64, 128, 3], the current one last: float32 [N, D].
 
         Raises:
+            ArrayError: another type or shape; the message says which, and their range.
             NumericalError: frames that are no uint8 hold what is not finite.
         """
-        if frames.dtype != np.uint8:
-            finite(frames, "frames")
         return encode_frames(
             functools.partial(read_frames, self.networks),
-            torch.from_numpy(frames),
+            frames_from(frames, (self.frames, *FRAME_SHAPE)),
             device=self.device,
             precision=self.precision,
         )
@@ -308,10 +313,10 @@ class Model:
         """Answer embeddings [N, D] with forces ÷ force limit [N, *A], clipped to ±1.
 
         Raises:
+            ArrayError: another type or shape.
             NumericalError: an embedding is not finite.
         """
-        if not z.isfinite().all():
-            finite(z.detach().float().cpu(), "z")
+        z = embeddings_from(z, self.architecture["embedding"])
         return self.networks[network].act(z).float()  # type: ignore[no-any-return, operator]
 
     def actor(self, z: Tensor) -> Tensor:

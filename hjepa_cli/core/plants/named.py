@@ -3,18 +3,19 @@
 import hashlib
 import inspect
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hjepa_cli import plugins
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
-from hjepa_cli.core.arrays import Floats, finite
+from hjepa_cli.core.arrays import Floats, array_from, described, finite
 from hjepa_cli.core.plants.cartpole import camera
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
 from hjepa_cli.core.plants.system import System, Teacher
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import ArrayError, UsageError
 
 VERSIONED = ("desktop", "gym")
 START = np.array([0.03, 0.1, 0.08, 0.5])  # m, m/s, rad, rad/s: where a seeded CartPole starts
@@ -48,6 +49,7 @@ def plant_of(settings: Settings) -> System:
                 f"{name} has {len(values)} values; plant {kind.name} has {len(kind.state_names)} "
                 f"states: {', '.join(kind.state_names)}",
                 hint=f"--plant {kind.name}, or a --config FILE.toml that sets {name}",
+                key=name,
             )
     return kind
 
@@ -104,6 +106,14 @@ class Camera(camera.Camera):
         super().__init__(cart_pole(plant))
 
 
+def _of_size(size: int, values: ArrayLike, name: str) -> NDArray[Any]:
+    """Return so many values in one row; raise ArrayError for any other number of them."""
+    array = array_from(values, name)
+    if array.size != size:
+        raise ArrayError(f"{name}: {described(array)}; expected {size} finite numbers")
+    return array.reshape(size)
+
+
 class CartPole:
     """It simulates one cart-pole, given as a plant or by its name, ``"desktop"`` or ``"gym"``.
 
@@ -113,6 +123,7 @@ class CartPole:
     Raises:
         UsageError: unknown plant, or no cart-pole.
         NumericalError: a state, a force or noise is not finite; the cart-pole stays as it was.
+        ArrayError: a state, a force or noise is not so many numbers.
     """
 
     def __init__(self, preset: CartPolePlant | str, *, seed: int | None = None) -> None:
@@ -130,7 +141,7 @@ class CartPole:
 
     @state.setter
     def state(self, state: ArrayLike) -> None:
-        self._poles.states = np.reshape(state, (1, 4))
+        self._poles.states = _of_size(4, state, "state").reshape(1, 4)
 
     def step(self, force_n: float, *, noise: ArrayLike | None = None) -> Floats:
         """Advance by one control step and return the new state ``[4]``.
@@ -139,8 +150,11 @@ class CartPole:
             force_n: force on the cart [N], clipped to ± ``plant.force_limit_n``.
             noise: ``[4]`` added to the state after the step; ``None`` adds none.
         """
-        added = None if noise is None else np.broadcast_to(finite(noise, "noise"), 4)
-        self._poles.step(np.reshape(force_n, 1))
+        added = None
+        if noise is not None:
+            found = finite(noise, "noise")
+            added = np.broadcast_to(found if found.ndim == 0 else _of_size(4, found, "noise"), 4)
+        self._poles.step(_of_size(1, force_n, "force_n").reshape(1))
         if added is not None:
             self.state = self.state + added
         return self.state

@@ -13,9 +13,10 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hjepa_cli.core.arrays import Bools, Floats, Pixels, finite
+from hjepa_cli.core.arrays import Bools, Floats, Pixels, described, finite
 from hjepa_cli.core.plants.linear import linearise, unstable_rate_rad_s
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import ArrayError, UsageError
+from hjepa_cli.plugins import check_members
 
 Teacher = Callable[[ArrayLike], Floats]
 
@@ -84,16 +85,27 @@ def runge_kutta_step(rate: Callable[[Floats], Floats], states: Floats, duration_
     return np.asarray(states + duration_s / 6 * (a + 2 * b + 2 * c + d))
 
 
-def check_states(states: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Return states as float64.
+def check_states(states: ArrayLike, shape: tuple[int, ...], name: str = "states") -> Floats:
+    """Return states, called so in messages, as float64.
 
     Raises:
-        ValueError: their shape is another one.
+        ArrayError: their shape is another one.
         NumericalError: one is not finite.
     """
-    checked = finite(states, "states")
+    checked = finite(states, name)
     if checked.shape != shape:
-        raise ValueError(f"states have shape {checked.shape}, not {shape}")
+        raise ArrayError(f"{name}: shape {checked.shape}, not {shape}; it is {described(checked)}")
+    return checked
+
+
+def check_rows(states: ArrayLike, names: tuple[str, ...]) -> Floats:
+    """Return states ``[n, S]``, as named, as float64; errors as of :func:`check_states`."""
+    checked = finite(states, "states")
+    if checked.ndim != 2 or checked.shape[1] != len(names):
+        raise ArrayError(
+            f"states: shape {checked.shape}, not (n, {len(names)}): {', '.join(names)}; they are "
+            f"{described(checked)}"
+        )
     return checked
 
 
@@ -212,8 +224,25 @@ class System(abc.ABC):
             UsageError: it has none.
         """
         raise UsageError(
-            f"conditions.pole_length = {scale:g}; plant {self.name} has no pole: leave it at 1"
+            f"conditions.pole_length = {scale:g}; plant {self.name} has no pole: leave it at 1",
+            key="conditions.pole_length",
         )
+
+    def check_members(self) -> None:
+        """Raise UsageError for members that are of another kind, or that do not go together."""
+        check_members(self, tuple, "state_names", "state_units", "action_shape")
+        check_members(self, (int, float), "step_s", "force_limit_n")
+        for name in ("step_s", "force_limit_n"):
+            if not 0 < (value := getattr(self, name)) < math.inf:
+                raise UsageError(f"plant '{self.name}': {name} = {value!r}; expected more than 0")
+        for one, other, counts in (
+            ("state_names", "state_units", (len(self.state_names), len(self.state_units))),
+            ("action_shape", "mirror", (math.prod(self.action_shape), np.size(self.mirror))),
+        ):
+            if counts[0] != counts[1]:
+                raise UsageError(
+                    f"plant '{self.name}': {one} is for {counts[0]} values, {other} for {counts[1]}"
+                )
 
     @property
     def unstable_rate_rad_s(self) -> float:

@@ -143,5 +143,6 @@ def _bad_snr(text: str, problem: str) -> UsageError:
     shown = text if len(text) <= 40 else f"{text[:40]}…"
     return UsageError(
         f"--snr {shown!r} {problem}; use START:STOP[:STEP] like 10:30 or 10:30:5, or a list like "
-        "10,20,30"
+        "10,20,30",
+        key="radio.snr_db",
     )

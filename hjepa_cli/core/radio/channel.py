@@ -6,16 +6,20 @@ ratios in dB; every function broadcasts over numpy arrays and returns a float64 
 input. ``docs/radio.md`` lists the assumptions.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ParamSpec
 
 import numpy as np
 import numpy.typing as npt
 
 from hjepa_cli.config.schema import CARRIER_GHZ
-from hjepa_cli.core.arrays import Bools, Floats
-from hjepa_cli.errors import UsageError
+from hjepa_cli.core.arrays import Bools, Floats, finite
+from hjepa_cli.errors import ArrayError, HjepaError, UsageError
+
+P = ParamSpec("P")
 
 DISTANCE_3D_M = (1.0, 600.0)  # validity of Table 7.4.1-1 for InF
 SNR_DB = (-100.0, 100.0)  # ours: wider than any link, narrow enough that nothing overflows
@@ -44,6 +48,21 @@ class PathLoss:
         )
 
 
+def of_arrays(function: Callable[P, Floats]) -> Callable[P, Floats]:
+    """Let a function of arrays raise ArrayError for shapes that do not go together."""
+
+    @functools.wraps(function)
+    def checked(*arguments: P.args, **named: P.kwargs) -> Floats:
+        try:
+            return function(*arguments, **named)
+        except HjepaError:
+            raise
+        except (TypeError, ValueError) as error:
+            raise ArrayError(f"{function.__name__}: {error}") from None
+
+    return checked
+
+
 # S/D: sparse or dense clutter; L/H: base station inside the clutter or above it.
 SCENARIOS = {
     "InF-LOS": PathLoss(31.84, 21.5, 19.0, 4.3),
@@ -54,6 +73,7 @@ SCENARIOS = {
 }
 
 
+@of_arrays
 def path_loss_db(scenario: str, carrier_ghz: npt.ArrayLike, distance_3d_m: npt.ArrayLike) -> Floats:
     """Return the median path loss in dB (TR 38.901 Table 7.4.1-1), without shadow fading.
 
@@ -81,6 +101,7 @@ def path_loss_row(scenario: str) -> PathLoss:
     return SCENARIOS[scenario]
 
 
+@of_arrays
 def line_of_sight_probability(
     scenario: str,
     distance_2d_m: npt.ArrayLike,
@@ -134,13 +155,15 @@ def line_of_sight_probability(
     return np.asarray(np.exp(-distance * decay_per_m))[()]
 
 
+@of_arrays
 def thermal_noise_dbm(bandwidth_hz: npt.ArrayLike, noise_figure_db: npt.ArrayLike) -> Floats:
     """Return the noise power −174 dBm/Hz + 10 log10 W + F in dBm."""
     bandwidth = positive("bandwidth", bandwidth_hz)
-    figure = np.asarray(noise_figure_db, np.float64)
+    figure = finite(noise_figure_db, "noise figure")
     return np.asarray(THERMAL_NOISE_DBM_PER_HZ + 10.0 * np.log10(bandwidth) + figure)[()]
 
 
+@of_arrays
 def received_snr_db(
     power_dbm: npt.ArrayLike,
     loss_db: npt.ArrayLike,
@@ -152,7 +175,7 @@ def received_snr_db(
     The arguments are P, PL as from :func:`path_loss_db`, N_c as from :func:`thermal_noise_dbm`, and
     |H|², linear; 1 gives the mean SNR.
     """
-    link = np.asarray(power_dbm, np.float64) - np.asarray(loss_db) - np.asarray(noise_dbm)
+    link = finite(power_dbm, "power") - finite(loss_db, "loss") - finite(noise_dbm, "noise")
     with np.errstate(divide="ignore"):  # a gain of 0 is −∞ dB
         return np.asarray(link + 10.0 * np.log10(_at_least_0("power gain", power_gain)))[()]
 
@@ -166,12 +189,14 @@ def rayleigh_power_gains(rng: np.random.Generator, shape: int | tuple[int, ...])
     return rng.standard_exponential(shape)
 
 
+@of_arrays
 def achievable_rate_bps(bandwidth_hz: npt.ArrayLike, snr_db: npt.ArrayLike) -> Floats:
     """Return the capacity W log2(1 + γ) in bit/s (paper, eq. 3)."""
     bandwidth = positive("bandwidth", bandwidth_hz)
     return np.asarray(bandwidth * np.log1p(snr_ratio(snr_db)) / math.log(2.0))[()]
 
 
+@of_arrays
 def outage_probability(
     rate_bps: npt.ArrayLike, bandwidth_hz: npt.ArrayLike, mean_snr_db: npt.ArrayLike
 ) -> Floats:

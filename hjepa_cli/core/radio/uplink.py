@@ -153,7 +153,8 @@ class Uplink:
             uncertainty=self._uncertainty,
         )
         repeats = (self._lost > 0) & self._able  # a copy that waits is worth less every slot
-        chosen = pick(np.where(repeats, np.inf, self._score(view)), self._access.blocks)
+        scores = self._checked(self._score(view))
+        chosen = pick(np.where(repeats, np.inf, scores), self._access.blocks)
         sent = chosen & self._able if self._slot else np.ones_like(chosen)
         failed = self._errors.random(len(chosen)) < self._round_errors[self._lost]
         arrived = sent & ~failed if self._slot else sent
@@ -168,6 +169,19 @@ class Uplink:
         self._reported[arrived] = 0.0
         self._slot += 1
         return arrived
+
+    def _checked(self, scores: object) -> Floats:
+        """Return scores; raise UsageError where they are none. It costs little beside a slot."""
+        found = np.asarray(scores)
+        if found.shape != self._gain.shape or found.dtype.kind not in "fiub":
+            shown = f"{np.shape(found)} of {found.dtype}"
+        elif math.isnan(found.max()):
+            shown = f"NaN for device {int(np.isnan(found).argmax())}"
+        else:
+            return found
+        name = self._access.scheduler
+        wanted = f"expected numbers of shape {self._gain.shape}"
+        raise SCHEDULERS.fault(name, f"scheduler '{name}': score(…) is {shown}; {wanted}")
 
     @property
     def _power(self) -> Floats:

@@ -7,28 +7,25 @@ actor makes of such a law is then corrected on embeddings, by a factor and the t
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.core.control.controllers import LastForce, Oracle
+from hjepa_cli.core.control.link import InFlight
 from hjepa_cli.core.control.loop import STATE_LIMIT, Draws, Sensor, gap_schedule, simulate
 from hjepa_cli.core.control.sensors import true_state
 from hjepa_cli.core.plants.linear import gains_at_rest
-from hjepa_cli.core.plants.system import System
+from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.core.statistics import first_crossing, ratio
+from hjepa_cli.core.training.search import best
 
 SEARCH_SEED = 2_000_003  # added to the seed: searches see other devices than any evaluation
-SEARCH_KEY = 0xDECA
 AROUND = (0.5, 0.7, 0.85, 1.0, 1.15)  # of the oracle's tolerated gap: where candidates are tried
-ELITE = 6  # one candidate in so many shapes the next round
 TIE = 0.1  # weight of the mean score beside the tolerated gap ÷ the longest that is tried
-Evaluate = Callable[[Floats], Floats]
-"""It says how good each of candidates [C, P] is: [C]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,6 +34,7 @@ class Trial:
 
     Attributes:
         kind: the nominal plant.
+        law: what devices play that know their state.
         draws: those of N devices.
         gaps: steps between packets [G].
         acceptable: the acceptable score ÷ the teacher's.
@@ -44,6 +42,7 @@ class Trial:
     """
 
     kind: System
+    law: Teacher
     draws: Draws
     gaps: Floats
     acceptable: float
@@ -51,30 +50,39 @@ class Trial:
 
     @classmethod
     def make(
-        cls, kind: System, protocol: ProtocolSettings, *, devices: int, steps: int, seed: int
+        cls,
+        kind: System,
+        law: Teacher,
+        protocol: ProtocolSettings,
+        *,
+        devices: int,
+        steps: int,
+        seed: int,
+        around: Sequence[float] = AROUND,
     ) -> "Trial":
-        """Draw devices, and find the gaps to try them at: around what the oracle tolerates.
+        """Draw devices, and find the gaps to try them at: ``around`` what the law tolerates.
 
-        The devices of the ``protocol`` all are nominal here, and ``steps`` are scored after its
-        warm-up.
+        That is with the true state and the exact equations. The devices of the ``protocol`` all are
+        nominal here, and ``steps`` are scored after its warm-up.
         """
         nominal = dataclasses.replace(protocol, steps=steps, plant_spread=0.0)
         draws = Draws.make(nominal, devices, seed + SEARCH_SEED)
         states = len(kind.state_names)
 
-        def shares(gaps: Floats) -> Floats:
+        def shares(act: Teacher, gaps: Floats, draws: Draws) -> Floats:
             loops = devices * len(gaps)
-            oracle = Oracle(kind.teacher(), kind.advance, kind.force_limit_n, loops, states=states)
-            trial = cls(kind, draws, gaps, protocol.acceptable_score, np.ones(devices))
+            limit_n, shape = kind.force_limit_n, kind.action_shape
+            oracle = Oracle(act, kind.advance, limit_n, loops, states=states, action_shape=shape)
+            trial = cls(kind, law, draws, gaps, protocol.acceptable_score, np.ones(devices))
             return trial.shares(oracle, true_state)
 
         grid = np.array(protocol.gaps, float)
-        (teacher,) = shares(np.ones(1))
-        scores = ratio(shares(grid), teacher)
+        (teacher,) = shares(kind.teacher(), np.ones(1), draws.on_device)
+        scores = ratio(shares(law, grid, draws), teacher)
         tolerated = float(first_crossing(grid, scores, protocol.acceptable_score, log=False))
         tolerated = float(np.clip(tolerated, grid[min(1, len(grid) - 1)], grid[-1]))
-        gaps = np.clip(np.array(AROUND) * tolerated, 1.0, steps)
-        return cls(kind, draws, gaps, protocol.acceptable_score, teacher)
+        gaps = np.clip(np.array(around) * tolerated, 1.0, steps)
+        return cls(kind, law, draws, gaps, protocol.acceptable_score, teacher)
 
     def first(self, devices: int) -> "Trial":
         """Return the same with fewer devices, or as many as there are."""
@@ -115,32 +123,15 @@ class Law:
     tau_steps: float  # τ
 
 
-def cross_entropy(
-    evaluate: Evaluate, mean: Floats, spread: Floats, *, candidates: int, rounds: int, seed: int
-) -> Floats:
-    """Return the mean [P] of the best candidates of the last round.
-
-    ``candidates`` are drawn from a normal distribution, which moves to the best of them, in each
-    round; ``mean`` and ``spread`` [P] are those of the first one.
-    """
-    random = generator(seed, SEARCH_KEY)
-    for _ in range(rounds):
-        drawn = mean + spread * random.standard_normal((candidates, len(mean)))
-        drawn[0] = mean
-        best = np.argsort(-evaluate(drawn), kind="stable")[: max(candidates // ELITE, 2)]
-        mean, spread = drawn[best].mean(axis=0), drawn[best].std(axis=0) + 0.05 * spread
-    return mean
-
-
 def search_law(
     trial: Trial, *, candidates: int, rounds: int, seed: int, tied: bool = False
 ) -> tuple[Law, float]:
     """Find K and τ together, on the true state; return the law and its factor.
 
-    K is sought as factors of the teacher's own gains at rest, each gain with a factor of its own
-    or, ``tied``, one for all. Otherwise the factor is in the gains, and 1 is returned.
+    K is sought as factors of the gains at rest of the trial's law, each gain with a factor of its
+    own or, ``tied``, one for all. Otherwise the factor is in the gains, and 1 is returned.
     """
-    gains_n = gains_at_rest(trial.kind.teacher(), len(trial.kind.state_names))
+    gains_n = gains_at_rest(trial.law, len(trial.kind.state_names))
     factors = 1 if tied else gains_n.size
 
     def law(candidate: Floats) -> tuple[Floats, Floats]:
@@ -149,7 +140,7 @@ def search_law(
 
     start = np.zeros(factors + 1)
     start[-1] = 0.5 * np.log(trial.gaps[-1])
-    found = cross_entropy(
+    found = best(
         lambda candidate: trial.quality(shares_of_laws(trial, *law(candidate))),
         start,
         np.full(factors + 1, 0.7),
@@ -164,7 +155,8 @@ def search_law(
 def shares_of_laws(trial: Trial, gains_n: Floats, tau_steps: Floats) -> Floats:
     """Return :meth:`Trial.shares` of laws K [C, m, S] and τ [C] on the true state.
 
-    The plant's exact equations move many candidates at once.
+    The plant's exact equations move many candidates at once. Packets are late as the draws say; no
+    force is lost.
     """
     kind, draws, schedules = trial.kind, trial.draws, trial.schedules
     count, shape = len(gains_n), (len(gains_n), len(trial.gaps), draws.devices)
@@ -174,10 +166,16 @@ def shares_of_laws(trial: Trial, gains_n: Floats, tau_steps: Floats) -> Floats:
     initial = np.broadcast_to(draws.initial, (*shape, draws.initial.shape[1]))
     states = kind.advance(initial, forces_n.reshape(action))
     inside = np.zeros(shape)
+    link = draws.link.tiled(len(trial.gaps))
+    in_flight = InFlight(link.delay_steps, link.extra_steps)
     for k in range(draws.steps):
         gap, device = np.nonzero(schedules[:, k])
-        if len(gap):
-            forces_n[:, gap, device] = -np.einsum("cms,cps->cpm", gains_n, states[:, gap, device])
+        packets = states[:, gap, device].swapaxes(0, 1)  # [packets, C, S]
+        arrived, packets, _ = in_flight.pass_on(schedules[:, k].ravel(), packets)
+        if packets is not None:
+            gap, device = np.nonzero(arrived.reshape(shape[1:]))
+            seen = packets.swapaxes(0, 1)
+            forces_n[:, gap, device] = -np.einsum("cms,cps->cpm", gains_n, seen)
         if k >= draws.warmup_steps:
             inside += kind.in_band(states)
         applied_n = np.clip(forces_n, -kind.force_limit_n, kind.force_limit_n)
@@ -213,7 +211,7 @@ def fit_decay(
         )
         return trial.quality(trial.shares(controller, sensor, len(candidate)))
 
-    found = cross_entropy(
+    found = best(
         evaluate,
         np.log(np.array(start)),
         np.full(2, 0.3),

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hjepa_cli.compute.interrupts import Postponed
 from hjepa_cli.core.training.ranks import ALONE, Ranks
-from hjepa_cli.errors import DataError
+from hjepa_cli.errors import DataError, shell
 from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 from hjepa_cli.storage.files import jsonable
 from hjepa_cli.storage.runs import Run, differences
@@ -210,5 +210,5 @@ class Progress:
         line = str(reason).partition("\n")[0]
         return DataError(
             f"{self._path} does not fit this run: {line}",
-            hint=f"delete it to train from the start: rm {self._path}",
+            hint=f"delete it to train from the start: {shell(['rm', self._path])}",
         )

@@ -5,11 +5,14 @@ statistics of batch norm are summed over all processes, so a step is that of one
 whole batch, whatever their number; only the order of the sums differs.
 """
 
+import asyncio
 import dataclasses
 import datetime
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +23,8 @@ from hjepa_cli.errors import HjepaError, UsageError
 
 # The others wait that long: for the first process while it examines the encoder, most of all.
 TIMEOUT = datetime.timedelta(minutes=30)
+_untyped: Any = dist  # its stores have no types
+QUIET_S, POLL_S = 3.0, 0.05  # processes that start together differ by a second or so
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +102,7 @@ def joined(device: torch.device, items: int) -> Iterator[Ranks]:
     Without it a process is alone. On GPUs, each process of a machine takes its own.
 
     Raises:
-        UsageError: more processes than windows, or than GPUs of this machine.
+        UsageError: more processes than windows, or than GPUs of this machine, or not all come.
     """
     size = torchrun.size()
     if size == 1:
@@ -122,11 +127,58 @@ def joined(device: torch.device, items: int) -> Iterator[Ranks]:
 
     # Counts and codes are exchanged on the CPU, whatever the device.
     backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
-    dist.init_process_group(backend, timeout=TIMEOUT)
+    store, rank = _meet(torchrun.rank(), size), torchrun.rank()
+    dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
     try:
-        yield Ranks(torchrun.rank(), size)
+        yield Ranks(rank, size)
     finally:
         dist.destroy_process_group()
+
+
+def _meet(rank: int, size: int) -> Any:
+    """Wait until all processes are there, say so where it takes long, and return what they share.
+
+    torch would wait for half an hour without a word, deaf to Ctrl-C and SIGTERM.
+
+    Raises:
+        UsageError: the port is taken, or some have not come in :data:`TIMEOUT`.
+    """
+    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    serves = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+    attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+    store, said, began_s = None, False, time.monotonic()
+    here = [f"{attempt}/{number}" for number in range(size)]
+    while True:
+        try:
+            if store is None:
+                if not serves:  # torch prints a page where nobody listens
+                    asyncio.run(_reach(host, port))
+                second = datetime.timedelta(seconds=1)
+                store = _untyped.TCPStore(host, port, size, serves, second, wait_for_workers=False)
+                store.set(here[rank], "")
+            if store.check(here):
+                store.set_timeout(TIMEOUT)
+                return _untyped.PrefixStore(attempt, store)
+        except (dist.DistError, OSError) as error:
+            if serves:
+                raise UsageError(
+                    f"MASTER_PORT = {port}: cannot listen there: {str(error).partition('.')[0]}",
+                    hint="set another MASTER_PORT for all processes",
+                ) from None
+            store = None  # whoever serves is not there yet, or has gone
+        waited_s = time.monotonic() - began_s
+        if waited_s > TIMEOUT.total_seconds():
+            raise UsageError(f"{size} processes did not all come to {host}:{port}")
+        if waited_s > QUIET_S and not said:
+            said = True
+            torchrun.announce(f"process {rank}: waiting for {size} processes at {host}:{port}")
+        time.sleep(POLL_S)
+
+
+async def _reach(host: str, port: int) -> None:
+    """Raise OSError unless somebody listens there."""
+    _, there = await asyncio.wait_for(asyncio.open_connection(host, port), timeout=1)
+    there.close()
 
 
 def all_reduce(tensor: Tensor) -> None:

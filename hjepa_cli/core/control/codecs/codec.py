@@ -10,6 +10,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
+from hjepa_cli.plugins import check_members
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -47,6 +49,11 @@ class Codec:
     fit: Callable[[Model, Settings], Coder]
     fitted: bool = False
 
+    def __post_init__(self) -> None:
+        """Raise UsageError for members that are of another kind."""
+        check_members(self, callable, "bits", "fit")
+        check_members(self, bool, "fitted")
+
 
 @dataclasses.dataclass(frozen=True)
 class CodecFamily:
@@ -61,3 +68,8 @@ class CodecFamily:
     name: str
     member: Callable[[str], Codec | None]
     described: str
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for members that are of another kind."""
+        check_members(self, callable, "member")
+        check_members(self, str, "described")

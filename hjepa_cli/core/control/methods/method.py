@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from hjepa_cli.core.style import Style
+from hjepa_cli.errors import UsageError, choices
+from hjepa_cli.plugins import check_members
 
 if TYPE_CHECKING:
     from torch import nn
@@ -63,6 +65,17 @@ class Method:
     kind: str | None = None
     modules: Modules | None = None
 
+    def __post_init__(self) -> None:
+        """Raise UsageError for members that are of another kind."""
+        if self.sends not in get_args(Sent):
+            known = choices(self.sends, get_args(Sent), "choose one of")
+            raise UsageError(f"Method '{self.name}': sends = {self.sends!r}; {known}")
+        check_members(self, callable, "build", "offered", "trained_by")
+        check_members(self, callable, "planner", "modules", optional=True)
+        check_members(self, bool, "needs_link", "fitted", "reflex", "compared")
+        check_members(self, str, "kind", optional=True)
+        check_members(self, Style, "style", optional=True)
+
     @property
     def needs_model(self) -> bool:
         """Tell whether a trained model must offer it."""
@@ -87,6 +100,10 @@ class MethodFamily:
     name: str
     member: Callable[[str], Method | None]
     members_of: Callable[[Architecture], Sequence[str]]
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for members that are of another kind."""
+        check_members(self, callable, "member", "members_of")
 
     def offers(self, architecture: Architecture, plant: System) -> tuple[str, ...]:
         """Return the names that a model of the architecture offers to the plant."""

@@ -21,29 +21,38 @@ if TYPE_CHECKING:
     from hjepa_cli.core.networks.planning import Planner
 
 
-def predictor(name: str, planner: Callable[[Model], Planner], **about: Any) -> Method:
+def predictor(
+    name: str, planner: Callable[[Model], Planner], *, fused: bool = False, **about: Any
+) -> Method:
     """Describe a method that plays a model's predictor, a stride at a time.
 
     Args:
         name: of the method.
         planner: makes the planner from a model that offers the method.
+        fused: packets correct what was predicted, by the model's posterior, and do not replace it.
         about: the other fields of :class:`~hjepa_cli.core.control.methods.method.Method`.
     """
 
     def build(settings: Settings, model: Model) -> Driver:
+        from hjepa_cli.core.control.controllers import FusingController
         from hjepa_cli.core.control.disagreement import TwoLevels
         from hjepa_cli.core.control.drivers import embedding_driver
         from hjepa_cli.core.control.planners import OnePredictor
 
-        drives = _strides(model, planner(model))
+        made: Any = planner(model)
+        drives = _strides(model, made)
+        if fused:
+            drives = functools.partial(
+                FusingController, made, action_shape=model.action_shape, correct=made.correct
+            )
 
         def two_levels(devices: int) -> TwoLevels:
             step = OnePredictor(model, model.networks["flat"], 1).step
             return TwoLevels(drives(devices), step, model.actor, model.force_limit_n)
 
-        return embedding_driver(
-            name, settings, model, drives, two_levels if planner is _hierarchy else None
-        )
+        second = two_levels if planner is _hierarchy else None
+        family = name if fused else "embedding"  # a packet is not all that it plays by
+        return embedding_driver(name, settings, model, drives, second, family)
 
     return Method(name, "embedding", build, planner=planner, **about)
 
@@ -67,6 +76,15 @@ HJEPA = predictor(
     trained_by=training("train-hierarchy"),
     compared=True,
     style=Style("#0072B2", "o", size=7.0),
+)
+
+HJEPA_FUSED = predictor(
+    "hjepa-fused",
+    _hierarchy,
+    fused=True,
+    offered=lambda architecture, plant: bool(architecture.get("fusion")),
+    trained_by=training("train-fusion"),
+    style=Style("#0072B2", "P", ":", size=7.0),
 )
 
 _STYLES = {  # of the depths that the paper compares

@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels, finite
-from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
+from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels
+from hjepa_cli.core.plants.cartpole.parameters import STATE_NAMES, CartPoleParameters
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.system import check_rows, check_states
 
 VERSION = 1  # raise it whenever any picture changes
 PIVOT_ROW_PX = 48  # from the top: an upright pole ends 5 px (desktop) or 8 px (gym) below the edge
@@ -67,8 +68,9 @@ class Camera:
 
         Raises:
             NumericalError: a state is not finite.
+            ValueError: their shape is another one.
         """
-        states = finite(states, "states")
+        states = check_rows(states, STATE_NAMES)
         count = len(states)
         # One pixel more than the frames have: whatever is cut off is drawn there.
         pixels = np.empty(count * HEIGHT_PX * WIDTH_PX + 1, _PIXEL)
@@ -95,7 +97,7 @@ class Camera:
 
     def sketch_px(self, state: ArrayLike) -> list[Floats]:
         """Return the pole's axis and the cart's outline of a state ``[4]``, (column, row) in px."""
-        x_m, _, theta, _ = finite(state, "state")
+        x_m, _, theta, _ = check_states(state, (len(STATE_NAMES),), "state")
         pivot = np.array([WIDTH_PX / 2 + x_m * self.scale_px_m, PIVOT_ROW_PX])
         length_px = 2 * self.plant.half_length_m * self.scale_px_m
         tip = pivot + length_px * np.array([np.sin(theta), -np.cos(theta)])
@@ -107,7 +109,9 @@ class Camera:
         """Draw a chunk of frames: each cart, then the band around its pole, which may cover it."""
         theta = states[:, 2].copy()
         mirrored = theta < 0
-        x_px = np.rint(states[:, 0] * (self.scale_px_m * _SUBPIXELS)) / _SUBPIXELS
+        reach_m = 2 * WIDTH_PX / self.scale_px_m  # out of sight
+        x_m = states[:, 0].clip(-reach_m, reach_m)
+        x_px = np.rint(x_m * (self.scale_px_m * _SUBPIXELS)) / _SUBPIXELS
         x_px = np.where(mirrored, -x_px, x_px).clip(-2 * WIDTH_PX, 2 * WIDTH_PX)
         column = np.floor(x_px)
         pivot_px = x_px - column  # right of the left edge of its pixel, 0 … 1

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from hjepa_cli.core.arrays import Floats
 
+STATE_NAMES = ("x", "x_dot", "theta", "theta_dot")
+
 
 @dataclasses.dataclass(frozen=True)
 class CartPoleParameters:

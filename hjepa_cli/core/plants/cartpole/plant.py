@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from hjepa_cli.core.arrays import Bools, Floats, finite
 from hjepa_cli.core.plants.cartpole.camera import Camera
-from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
+from hjepa_cli.core.plants.cartpole.parameters import STATE_NAMES, CartPoleParameters
 from hjepa_cli.core.plants.cartpole.teacher import sdre
 from hjepa_cli.core.plants.cost import stage_cost
 from hjepa_cli.core.plants.frames import WIDTH_PX
@@ -25,7 +25,7 @@ SCORE_THETA_RAD = 0.05
 class CartPolePlant(CartPoleParameters, System):
     """A kind of cart-pole is its numbers with all that surrounds them."""
 
-    state_names: ClassVar[tuple[str, ...]] = ("x", "x_dot", "theta", "theta_dot")
+    state_names: ClassVar[tuple[str, ...]] = STATE_NAMES
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "rad", "rad/s")
 
     def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> "CartPoles":

@@ -11,6 +11,7 @@ Drift half, kick, drift half is the leapfrog scheme: second order, at no cost.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import pymunk
@@ -70,7 +71,7 @@ class CartPoles:
         mass_scale: ArrayLike | None = None,
     ) -> None:
         self.plant = parameters
-        scale = check_masses(devices, mass_scale)
+        self._mass_scale = scale = check_masses(devices, mass_scale)
         self.devices = devices
         self._substep_s = self.plant.step_s / self.plant.substeps
         self._space = self._build(scale)
@@ -78,6 +79,21 @@ class CartPoles:
         self._force = _Writer(devices, pymunk.batch.BodyFields.FORCE, 2)
         self._reading = pymunk.batch.Buffer()
         self.states = np.zeros((devices, 4))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy and pickle what defines the simulation, of which pymunk's own objects are made.
+
+        A copy moves like the original up to rounding: pymunk does not tell the impulses that it
+        remembers of the last step.
+        """
+        made_of = {"parameters": self.plant, "devices": self.devices}
+        return made_of | {"mass_scale": self._mass_scale, "states": self.states}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        made_of = dict(state)
+        states = made_of.pop("states")
+        self.__init__(**made_of)  # type: ignore[misc]
+        self.states = states
 
     def _build(self, mass_scale: Floats) -> pymunk.Space:
         kind = self.plant

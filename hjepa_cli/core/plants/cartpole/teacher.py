@@ -11,9 +11,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hjepa_cli.core.arrays import Floats, finite
+from hjepa_cli.core.arrays import Floats, described, finite
 from hjepa_cli.core.plants.cartpole.parameters import CartPoleParameters
 from hjepa_cli.core.plants.system import Teacher
+from hjepa_cli.errors import ArrayError
 
 THETA_LIMIT_RAD = 1.2
 THETA_DOT_LIMIT_RAD_S = 25.0
@@ -67,6 +68,8 @@ def sdre(plant: CartPoleParameters) -> Teacher:
 
     def force_n(states: ArrayLike) -> Floats:
         states = finite(states, "states")
+        if states.shape[-1:] != (4,):
+            raise ArrayError(f"states: {described(states)}; expected [..., 4]")
         flat = states.reshape(-1, 4)
         place = (np.clip(flat[:, 2:], -limits, limits) + limits) * per_cell
         cell = np.minimum(place.astype(np.intp), last)

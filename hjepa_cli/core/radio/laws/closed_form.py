@@ -4,11 +4,15 @@ The rows, those of ``scale --json``, put the count beside the bits that control 
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
+from numbers import Integral, Real
+from typing import Any
 
 from hjepa_cli.core.radio.capacity import Cell, Link
 from hjepa_cli.core.radio.laws.law import Row, SharingLaw
 from hjepa_cli.core.radio.laws.requirement import Axis, LinkRequirement
+from hjepa_cli.plugins import LAWS, check_members
 
 
 def _too_crowded(tolerance: float, loop: LinkRequirement, link: Link) -> str:
@@ -33,6 +37,27 @@ class ClosedFormLaw(SharingLaw):
     packets_per_slot: Callable[[float, LinkRequirement, Link], float] | None = None
     why_nobody: Callable[[float, LinkRequirement, Link], str] = _too_crowded
     delay_slots: Callable[[Link], float] = lambda link: 0.0
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for members that are of another kind."""
+        super().__post_init__()
+        check_members(self, Axis, "axis")
+        check_members(self, callable, "devices", "why_nobody", "delay_slots")
+        check_members(self, callable, "packets_per_slot", optional=True)
+
+    def asked(self, member: str, *at: Any) -> Any:
+        """Return what a function of the law says; raise UsageError where it may not say that."""
+        value = getattr(self, member)(*at)
+        if member == "why_nobody":
+            fits, wanted = isinstance(value, str), "text"
+        else:
+            whole = member == "devices"
+            fits = isinstance(value, Integral if whole else Real) and 0 <= float(value) < math.inf
+            wanted = f"a {'whole' if whole else 'finite'} number of at least 0"
+        if not fits:
+            says = f"law '{self.name}': {member}(…) = {value!r}; expected {wanted}"
+            raise LAWS.fault(self.name, says)
+        return value
 
     def row(self, loop: LinkRequirement, cell: Cell, snr_db: float) -> Row:
         """Count one method's devices at one SNR; where there are none, give the reason.
@@ -60,16 +85,20 @@ class ClosedFormLaw(SharingLaw):
             return row | {"reason": "sends nothing: as many as there are, without this cell"}
         at = loop.tolerance, loop, (link := cell.link(loop.payload_bits, snr_db))
         ends = loop.interval or (loop.tolerance, loop.tolerance)
-        row["devices"] = self.devices(*at)
-        row["devices_ci95"] = [self.devices(end, loop, link) for end in ends]
+        row["devices"] = self.asked("devices", *at)
+        row["devices_ci95"] = [self.asked("devices", end, loop, link) for end in ends]
         row["load_per_block"] = row["devices"] / link.packets_per_slot
         if row["devices"] == 0:
             # The range of a method ends at its best link, too, if it was measured nowhere else.
             fails = loop.tolerance == self.axis.fails_at and not loop.at_least
             failure = "below the acceptable score even with a packet in every slot"
-            return row | {"reason": failure if fails else self.why_nobody(*at)}
+            return row | {"reason": failure if fails else self.asked("why_nobody", *at)}
         given = self.packets_per_slot
-        arriving = given(*at) if given else self.axis.packets_per_slot(loop.tolerance)
+        arriving = (
+            self.asked("packets_per_slot", *at)
+            if given
+            else self.axis.packets_per_slot(loop.tolerance)
+        )
         row["bits_per_s"] = loop.payload_bits * arriving / cell.slot_s
         if cell.limit_bits_per_s > 0:
             row["ratio_to_limit"] = row["bits_per_s"] / cell.limit_bits_per_s

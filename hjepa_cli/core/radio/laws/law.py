@@ -3,6 +3,8 @@
 import dataclasses
 from typing import Any
 
+from hjepa_cli.plugins import check_members
+
 Row = dict[str, Any]  # of ``scale --json``
 
 
@@ -22,3 +24,8 @@ class SharingLaw:
     help: str
     uses: tuple[str, ...] = ()
     snr_label: str = "Target SNR (dB)"
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for members that are of another kind."""
+        check_members(self, str, "help", "snr_label")
+        check_members(self, tuple, "uses")

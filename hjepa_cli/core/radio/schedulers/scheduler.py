@@ -12,7 +12,7 @@ import numpy as np
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable
 from hjepa_cli.core.style import PLAIN, Style
-from hjepa_cli.errors import UsageError
+from hjepa_cli.plugins import check_members
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +63,10 @@ class Scheduler:
     style: Style = PLAIN
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a score that cannot be called."""
-        if not callable(self.score):
-            raise UsageError(f"scheduler '{self.name}': score = {self.score!r} is no function")
+        """Raise UsageError for members that are of another kind."""
+        check_members(self, callable, "score")
+        check_members(self, bool, "wants_reports")
+        check_members(self, Style, "style")
 
 
 def pick(scores: Floats, blocks: int) -> Bools:

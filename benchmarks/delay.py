@@ -1,0 +1,181 @@
+"""Devices per cell against the delay of packets, by method, and the predictor calls that it takes.
+
+    python benchmarks/delay.py --out delay [--checkpoint MODEL] [--delays 0,10,20,30,40,60,80]
+
+For each delay ``hjepa scale --law duty`` counts the devices of a cell at one SNR. ``--tune`` first
+tunes ``hold-decay`` and ``hold-decay-linear`` to each delay with ``hjepa train-reflex``, so that
+what predicts nothing is at its best, too; their rows say ``tuned``. Settings of loops, and whatever
+else differs from the preset, come from ``--config``.
+
+Everything is kept below ``--out``, a directory for each point: an interrupted study goes on with
+the same command, and more delays only add to it. All numbers go to ``OUT/delay.json``, the table to
+``OUT/delay.csv`` and to the screen, devices against delay to ``OUT/delay.png``.
+"""
+
+import argparse
+import csv
+import hashlib
+import json
+import tomllib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from study import as_toml, hjepa
+
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.drivers import build_driver, methods_of
+from hjepa_cli.core.control.loop import LOOP_VERSION, Draws, gap_schedule, simulate
+from hjepa_cli.core.networks.model import LEVELS, Model
+from hjepa_cli.core.plants.conditions import actual_plant
+from hjepa_cli.output import figures
+from hjepa_cli.plugins import METHODS
+from hjepa_cli.storage.files import write_json, write_text
+from hjepa_cli.storage.zoo import resolve_model
+
+COMPARED = "hjepa,ts-jepa-1,ts-jepa-4,linear,chunk-forces,hold-decay,hold,oracle"
+TUNED = ("hold-decay", "hold-decay-linear")
+CALLS_AT = (20, 80)  # steps between packets where calls are counted
+CALLS_DEVICES, CALLS_STEPS = 8, 400
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--checkpoint", default="desktop-h4m2l1", help="zoo name, run or file")
+    parser.add_argument("--delays", default="0,10,20,30,40,60,80", help="in control steps")
+    parser.add_argument("--methods", default=COMPARED)
+    parser.add_argument("--snr", default="20", help="dB")
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--config", type=Path, help="TOML file of other settings")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tune", action="store_true", help="hold-decay to each delay")
+    parser.add_argument("--dataset", type=Path, help="for --tune")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    methods, rows = options.methods.split(","), []
+    for delay in map(int, options.delays.split(",")):
+        tuned = [name for name in methods if options.tune and name in TUNED]
+        others = [name for name in methods if name not in tuned]
+        rows += counted(options, delay, others, options.checkpoint, "")
+        if tuned:
+            rows += counted(options, delay, tuned, tune(options, delay), "tuned")
+        write(rows, options)
+    print((options.out / "delay.csv").read_text())
+
+
+def counted(
+    options: argparse.Namespace, delay: int, methods: list[str], checkpoint: Any, note: str
+) -> list[dict[str, Any]]:
+    """One row a method: devices, tolerated gap, scores, bits and calls at one delay."""
+    words = ("--law", "duty", "--snr", options.snr, "--delay-steps", delay)
+    words += ("--methods", ",".join(methods), "--checkpoint", checkpoint)
+    where = point(options, "scale", *words)
+    words += ("--preset", options.preset, "--seed", options.seed, "--out", where)
+    result = hjepa("scale", *words, *(("--config", options.config) if options.config else ()))
+    measured = {
+        name: entry
+        for path in where.glob("curves*.json")
+        for name, entry in json.loads(path.read_text())["methods"].items()
+    }
+    step_ms = 1e3 * result["slot_s"]
+    rows = []
+    for row in result["rows"]:
+        name = row["method"].partition("+")[0]
+        entry = measured[row["method"]]
+        scores = {f"{at['d']:g}": [at["score"], *at["ci95"]] for at in entry["gap_curve"]}
+        rows.append(
+            {
+                "delay_ms": delay * step_ms,
+                "method": row["method"],
+                "note": note,
+                **{key: row[key] for key in ("devices", "devices_ci95", "at_least", "reason")},
+                "tolerance_gap_steps": entry["tolerance_gap_steps"],
+                "tolerance_gap_ci95": entry["tolerance_gap_ci95"],
+                "bits_per_transmission": row["bits_per_transmission"],
+                "scores": scores,
+                "calls_per_step": calls(options, delay, name),
+            }
+        )
+    return rows
+
+
+def tune(options: argparse.Namespace, delay: int) -> Path:
+    """Where a model lies whose decaying holds were tuned to the delay; its chunks are untrained."""
+    given = tomllib.loads(options.config.read_text()) if options.config else {}
+    given["protocol"] = given.get("protocol", {}) | {"delay_steps": delay}
+    given["reflex"] = given.get("reflex", {}) | {"steps": 1}
+    words = ("--checkpoint", options.checkpoint)
+    words += ("--dataset", options.dataset) if options.dataset else ()
+    where = point(options, "train-reflex", *words, delay)
+    config = where.with_suffix(".toml")
+    alone = {key: given.pop(key) for key in list(given) if not isinstance(given[key], dict)}
+    lines = [f"{key} = {json.dumps(value)}\n" for key, value in alone.items()]
+    write_text(config, "".join(lines) + as_toml(given))
+    named = ("--preset", options.preset, "--seed", options.seed, "--config", config)
+    hjepa("train-reflex", *words, *named, "--out", where)
+    return where
+
+
+def calls(options: argparse.Namespace, delay: int, name: str) -> dict[str, dict[str, float]]:
+    """Embeddings that each level of the model moves on, per device and control step, by gap."""
+    model = Model.load(resolve_model(options.checkpoint), "cpu")
+    if not METHODS[name].planner or name not in methods_of(model):
+        return {}
+    flags = {"seed": options.seed, "protocol": "paper", "protocol.steps": CALLS_STEPS}
+    settings = load_settings(
+        options.preset, options.config, {**flags, "protocol.delay_steps": delay}
+    )
+    rows: Counter[str] = Counter()
+    for level in LEVELS[model.architecture["kind"]]:
+        count = lambda module, given, made, level=level: rows.update({level: len(made)})  # noqa: E731
+        model.networks[level].register_forward_hook(count)
+    driver, found = build_driver(name, settings, model), {}
+    draws = Draws.make(settings.protocol, CALLS_DEVICES, options.seed)
+    for gap in CALLS_AT:
+        rows.clear()
+        schedule = gap_schedule(gap, draws.steps, CALLS_DEVICES)
+        kind = actual_plant(settings.plant, settings.conditions)
+        controller = driver.controller(CALLS_DEVICES)
+        simulate(kind, draws, schedule[None], controller, driver.sensor)
+        found[f"{gap}"] = {level: count / schedule.size for level, count in rows.items()}
+    return found
+
+
+def point(options: argparse.Namespace, stage: str, *of: Any) -> Path:
+    """The directory of a point, named after all that it depends on."""
+    config = options.config.read_text() if options.config else ""
+    described = json.dumps([LOOP_VERSION, options.preset, options.seed, config, *map(str, of)])
+    return options.out / f"{stage}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
+
+
+def write(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
+    """All rows as JSON, the table as CSV, the devices as a figure."""
+    write_json(options.out / "delay.json", {"checkpoint": str(options.checkpoint), "rows": rows})
+    with (options.out / "delay.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        head = ("delay_ms", "method", "note", "devices", "low", "high", "gap_steps", "low", "high")
+        table.writerow([*head, "score_20", "low", "high", "bits", "calls_20"])
+        for row in rows:
+            gap = [row["tolerance_gap_steps"], *(row["tolerance_gap_ci95"] or ("", ""))]
+            table.writerow(
+                [
+                    *(row[key] for key in head[:4]),
+                    *(row["devices_ci95"] or ("", "")),
+                    *gap,
+                    *row["scores"].get("20", ("", "", "")),
+                    row["bits_per_transmission"],
+                    sum(row["calls_per_step"].get("20", {}).values()) or "",
+                ]
+            )
+    drawn = [
+        row | {"snr_db": row["delay_ms"], "method": " ".join((row["method"], row["note"])).strip()}
+        for row in rows
+        if row["devices"] is not None
+    ]
+    label = "Delay from a packet's capture to the force (ms)"
+    figures.save(figures.devices_figure(drawn, snr_label=label), options.out / "delay.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,247 @@
+"""What a finished run says is checked before anything of it is shown: it may be anybody's.
+
+A seal tells that a result was not changed; only its values tell that it is one of its stage.
+"""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from hjepa_cli.core.evaluation import curves
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.errors import DataError, UsageError, shell
+from hjepa_cli.plugins import LAWS
+from hjepa_cli.storage import runs
+
+LARGEST = 1e100  # bounds beyond anything that is measured keep arithmetic in range
+
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
+Positive = Annotated[float, Meta(gt=1e-100, le=LARGEST)]
+Whole = Annotated[int, Meta(ge=0, le=10**18)]
+Interval = tuple[NotNegative, NotNegative]
+Windows = dict[str, Number | None]
+
+
+class _Gate(msgspec.Struct):
+    value: Number | None
+    threshold: Number
+    passed: bool
+
+
+class _Strides(msgspec.Struct):
+    h: Whole | str
+    m: Whole | str
+    l: Whole | str
+
+
+class _Decay(msgspec.Struct):
+    gain: Number | None = None
+    tau_steps: Number | None = None
+
+
+class _Reflex(_Decay, kw_only=True):
+    law: _Decay
+
+
+class _Row(msgspec.Struct):
+    snr_db: Number
+    method: str
+    devices: NotNegative | None
+    devices_ci95: Interval | None
+    at_least: bool | None
+    bits_per_s: NotNegative | None
+    bits_per_transmission: NotNegative | None = None
+    ratio_to_limit: NotNegative | None = None
+    scheduler: str | None = None
+    reason: str | None = None
+    load_per_block: NotNegative | None = None
+    load_ci95: Interval | None = None
+    tolerance: NotNegative | None = None
+    tolerance_ci95: Interval | None = None
+    delay_steps: NotNegative | None = 0
+    reports_per_block_slot: NotNegative | None = None
+    coverage: Annotated[float, Meta(ge=0, le=1)] | None = None
+
+
+class _Gain(msgspec.Struct):
+    method: str
+    over: str
+    snr_db: Number
+    ratio: NotNegative | None
+    ratio_ci95: tuple[NotNegative | None, NotNegative | None]
+
+
+class _Trained(msgspec.Struct):
+    checkpoint: str
+    seconds: NotNegative
+
+
+class _Encoder(_Trained):
+    gates: dict[str, _Gate]
+
+
+class _Hierarchy(_Trained):
+    strides: _Strides
+    nmae_windows: Windows
+    method: str = "hjepa"
+
+
+class _Reflexes(_Trained):
+    reflex: _Reflex
+    nmae_windows: Annotated[dict[str, Windows], Meta(min_length=1)]
+    n_rollouts: Whole
+
+
+class _Fusion(_Trained):
+    packets: Whole
+    distances: dict[str, Number]
+
+
+class _Evaluation(msgspec.Struct):
+    plant: str
+    seed: Whole
+    checkpoint: str | None
+    methods: dict[str, dict[str, Any]]
+    checkpoints: dict[str, str] = {}
+    acceptable_score: Number = 0.0
+    acceptable_lq_ratio: Number = 0.0
+    source: str = ""
+
+
+class _Scale(msgspec.Struct):
+    rows: Annotated[list[_Row], Meta(min_length=1)]
+    seed: Whole
+    acceptable_score: Number
+    law: str
+    bandwidth_hz: Positive
+    slot_s: Positive
+    n_devices: Whole
+    limit_bits_per_s: NotNegative
+    paper_gain_percent: Number
+    gains: list[_Gain]
+    csv: str = ""
+    figures: list[str] = []
+
+
+class _Wire(msgspec.Struct):
+    model: str
+    method: str
+    plant: str
+    seed: Whole
+    devices: Whole
+    steps: Whole
+    lockstep: bool
+    period_ms: Positive | None
+    score_link: Number
+    score_link_ci95: tuple[Number, Number]
+    score_simulated: Number
+    score_simulated_ci95: tuple[Number, Number]
+    score_difference: Number
+    score_difference_ci95: tuple[Number, Number]
+    n_devices: Whole
+    n_steps: Whole
+    missing_share: NotNegative
+    late_answers_share: NotNegative
+    ages: dict[str, Whole]
+    sources: dict[str, Whole]
+    skipped_strides: Whole
+    theta_difference_rad: dict[str, NotNegative] = {}
+    fallen_share: NotNegative | None = None
+    taken_up_after_s: NotNegative | None = None
+
+
+RESULTS = {
+    "train-encoder": _Encoder,
+    "train-hierarchy": _Hierarchy,
+    "train-reflex": _Reflexes,
+    "train-fusion": _Fusion,
+    "eval": _Evaluation,
+    "scale": _Scale,
+    "bench-link": _Wire,
+}
+
+
+class _Protocol(msgspec.Struct):
+    acceptable_score: Number
+
+
+class _Config(msgspec.Struct):
+    """A report draws with this much of a run's settings."""
+
+    plant: str
+    methods: list[str]
+    protocol: _Protocol
+
+
+@contextlib.contextmanager
+def showing(stage: str, result: Mapping[str, Any] | None, directory: Path) -> Iterator[None]:
+    """Check a recorded result, none of a new run, and turn what it lacks inside into DataError."""
+    if result is not None and stage in RESULTS:
+        check(stage, result, directory)
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        if result is None:
+            raise
+        raise damaged(directory, stage, error) from None
+
+
+def check(stage: str, result: Mapping[str, Any], directory: Path) -> None:
+    """Raise DataError unless a result is one that the stage, one of :data:`RESULTS`, writes."""
+    if reason := _flaw(stage, result):
+        raise damaged(directory, stage, reason)
+
+
+def check_config(stage: str, config: Mapping[str, Any], directory: Path) -> None:
+    """Raise DataError unless a run's settings have what is shown with its result."""
+    try:
+        msgspec.convert(config, _Config)
+        plant(config["plant"])
+    except (msgspec.ValidationError, UsageError) as error:
+        raise damaged(directory, stage, error, runs.CONFIG) from None
+
+
+def damaged(directory: Path, stage: str, reason: object, name: str = runs.RESULT) -> DataError:
+    """Return the error of a run whose file is not what its stage writes."""
+    return DataError(
+        f"{directory / name} lacks what a {stage} run has: {reason}",
+        hint=shell(["hjepa", stage, "--config", directory / runs.CONFIG]),
+    )
+
+
+def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
+    """Return what keeps a result from being shown, if anything."""
+    if stage not in RESULTS:
+        return "its stage is none of ours"
+    try:
+        msgspec.convert(result, RESULTS[stage])
+    except msgspec.ValidationError as error:
+        return str(error)
+    if stage == "eval":
+        entries = result["methods"]
+        former = {"tolerance_gap_lq_steps": None}  # which older ones lack
+        flaws = ((name, curves.flaw(former | entry)) for name, entry in entries.items())
+        if found := next(((name, reason) for name, reason in flaws if reason), None):
+            return f"method '{found[0]}': {found[1]}"
+        return _unlike("methods", [entry["nmae_windows"] for entry in entries.values()])
+    if stage == "train-reflex":
+        return _unlike("methods", list(result["nmae_windows"].values()))
+    if stage == "scale":
+        if result["law"] not in LAWS:
+            return f"law '{result['law']}' is of no plugin in force"
+        at: dict[tuple[str, str | None], list[float]] = {}
+        for row in result["rows"]:
+            at.setdefault((row["method"], row.get("scheduler")), []).append(row["snr_db"])
+        if len({tuple(sorted(snrs)) for snrs in at.values()}) > 1:
+            return "its methods are not all counted at the same SNRs"
+    return None
+
+
+def _unlike(what: str, windows: list[dict[str, Any]]) -> str | None:
+    """Return the complaint where not all have the same windows of steps."""
+    return f"its {what} have different windows" if len({*map(frozenset, windows)}) > 1 else None

@@ -1,0 +1,96 @@
+"""``hjepa tune-law`` searches a control law that is good at sparse packets.
+
+Settings → ``law.toml`` with the law that models learn and the one of method ``ceiling``. The laws
+of shipped plants come with the package (``hjepa_cli/config/laws.toml``).
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.plants.control_law import check_stable
+from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.training.law_search import GAPS, LawSearch
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
+from hjepa_cli.storage.files import write_text
+from hjepa_cli.storage.runs import Run
+
+LAW = "law.toml"
+
+
+def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[str, Any]:
+    """Search both laws and write them; return the document of ``--json``.
+
+    Raises:
+        NumericalError: the search found no law that holds the plant.
+    """
+    kind = plant(settings.plant)
+    with Run.create("tune-law", out, settings.as_dict()) as record:
+        if record.result is not None:
+            screen.say(f"{record.directory} is finished; this is its result")
+            _show(record.result, screen)
+            return record.result
+        began = time.perf_counter()
+        search = LawSearch.make(kind, settings.protocol, settings.tune, settings.seed)
+        found: dict[str, Floats] = {}
+        for name in ("gains_n", "ceiling_gains_n"):
+            screen.say(f"searching control.{name} of plant {kind.name} on the true state")
+            found[name] = np.round(search.gains_n(learnable=name == "gains_n"), 3)
+            check_stable(kind, found[name], f"control.{name}")
+        result = {
+            "plant": kind.name,
+            "seed": settings.seed,
+            "gaps": search.trial.gaps.tolist(),
+            "scores": {name: search.scores(one[None])[0].tolist() for name, one in found.items()},
+            **{name: gains.tolist() for name, gains in found.items()},
+            "law": str(record.path(LAW)),
+            "seconds": time.perf_counter() - began,
+        }
+        lines = [f"# hjepa tune-law --plant {kind.name} --seed {settings.seed}"]
+        lines += [f'plant = "{kind.name}"', "", "[control]"]
+        lines += [f"{name} = {gains.ravel().tolist()}" for name, gains in found.items()]
+        write_text(record.path(LAW), "\n".join(lines) + "\n")
+        result = record.finish(result)
+    _show(result, screen)
+    screen.say(
+        f"law {result['law']} in {result['seconds']:.0f} s; "
+        f"next: hjepa collect --config {result['law']}"
+    )
+    return result
+
+
+def plan(settings: Settings, *, out: Path | None = None) -> Plan:
+    """Plan both searches."""
+    options, protocol = settings.tune, settings.protocol
+    loops = 2 * options.candidates * options.rounds * options.devices * len(GAPS)
+    return Plan(
+        command="tune-law",
+        reads=[],
+        work=[
+            f"search 2 laws of plant {settings.plant} in {options.rounds} rounds of "
+            f"{options.candidates} candidates, each at {len(GAPS)} gaps on {options.devices} "
+            "devices"
+        ],
+        writes=[f"run {run_directory('tune-law', out)} with {LAW}"],
+        writes_bytes=10_000,
+        seconds=seconds_of(
+            {"device-steps of searches": 3 * loops * (protocol.warmup_steps + options.steps)}
+        ),
+    )
+
+
+def _show(result: dict[str, Any], screen: Screen) -> None:
+    rows = [
+        [name, *(f"{score:.3f}" for score in scores)] for name, scores in result["scores"].items()
+    ]
+    screen.table(
+        f"{result['plant']}, seed {result['seed']}: score by gap, in the teacher's with a packet "
+        "at every step; true state and exact equations",
+        ["law", *(f"{gap:.0f}" for gap in result["gaps"])],
+        rows,
+    )
