@@ -247,6 +247,7 @@ COMMANDS = (
         Imported("hjepa_cli.stages.export:run"),
         ("name_or_path:export", "to", "check", "method", "backend"),
         product="directory",
+        plan=Imported("hjepa_cli.stages.export:plan"),
         panel=WIRE,
     ),
     Command(
@@ -257,6 +258,7 @@ COMMANDS = (
             *("model", "bind", "key", "max_devices", "timeout_s", "metrics", "websocket"),
             *("backend", "for_s"),
         ),
+        plan=Imported("hjepa_cli.stages.serve:plan"),
         panel=WIRE,
     ),
     Command(
@@ -269,6 +271,7 @@ COMMANDS = (
             *("stop_after_s", "steps:wire", "precision", "backend", *RESOLVED),
         ),
         check=_one_rule,
+        plan=Imported("hjepa_cli.stages.device:plan"),
         panel=WIRE,
     ),
     Command(
@@ -276,6 +279,7 @@ COMMANDS = (
         "Pass datagrams on as a bad network would: losses, delay, jitter, order, rate; seeded.",
         Imported("hjepa_cli.stages.link:run"),
         ("listen", "to:link", *_LINK, "seed:link", "for_s"),
+        plan=Imported("hjepa_cli.stages.link:plan"),
         panel=WIRE,
     ),
     staged(

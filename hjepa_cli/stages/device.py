@@ -14,6 +14,7 @@ from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, Unavailable, UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.plan import Plan
 from hjepa_cli.stages.serve import key_for
 from hjepa_cli.wire.actuator import Actuator, open_actuator
 from hjepa_cli.wire.bundle import Bundle, exported_by, open_bundle
@@ -123,6 +124,24 @@ def run(
         "ignored": device.ignored,
         "score": plants[0].score if plants else None,
     }
+
+
+def plan(
+    settings: Settings,
+    *,
+    model: Path,
+    server: str,
+    key: Path | None,
+    camera: str,
+    steps: int | None,
+) -> Plan:
+    """Plan a device; arguments and errors as of :func:`run`."""
+    key_for(parse_address(server, "--server"), "--server", key)
+    bundle = open_bundle(model)
+    check_plant(bundle, settings)
+    until = "until interrupted" if steps is None else f"for {steps} steps"
+    work = [f"send what camera {camera} sees to {server} and play its forces {until}"]
+    return Plan("device", [f"exported model {model}"], work, [], 0, (steps or 0) * bundle.step_s)
 
 
 def check_plant(bundle: Bundle, settings: Settings) -> None:

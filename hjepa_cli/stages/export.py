@@ -8,10 +8,11 @@ from typing import Any
 
 from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.plan import Plan
 from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint
 from hjepa_cli.wire import export as exports
-from hjepa_cli.wire.bundle import Bundle, open_bundle
+from hjepa_cli.wire.bundle import CHECK, MANIFEST, Bundle, open_bundle
 
 
 def run(
@@ -67,6 +68,21 @@ def run(
         "checkpoint": path,
         **measured,
     }
+
+
+def plan(
+    *, name_or_path: str | None = None, to: Path | None = None, check: Path | None = None
+) -> Plan:
+    """Plan an export or a check; arguments and errors as of :func:`run`."""
+    if check is not None:
+        open_bundle(check)
+        work = [f"compare it with torch on {exports.CHECKED} pictures"]
+        return Plan("export", [str(check)], work, [f"{check}/{CHECK}"], 1000, 15.0)
+    if to is None or name_or_path is None:
+        run(Screen(quiet=True), name_or_path=name_or_path, to=to)
+    path = zoo.resolve_model(name_or_path or "")
+    work = ["write its networks as ONNX", f"compare them on {exports.CHECKED} pictures"]
+    return Plan("export", [str(path)], work, [f"{to}/{MANIFEST}, networks"], 15_000_000, 60.0)
 
 
 def checkpoint_of(bundle: Bundle) -> Path:

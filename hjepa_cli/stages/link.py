@@ -7,6 +7,7 @@ from typing import Any
 
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.plan import Plan
 from hjepa_cli.wire.relay import Direction, Impairment, Relay, Trace
 from hjepa_cli.wire.server import is_loopback, open_socket, parse_address, resolve, written
 
@@ -56,6 +57,14 @@ def run(
     counts = dict(relay.counts)
     screen.say(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items()))
     return counts
+
+
+def plan(*, listen: str, to: str, for_s: float | None) -> Plan:
+    """Plan a relay; arguments and errors as of :func:`run`."""
+    for text, flag in ((listen, "--listen"), (to, "--to")):
+        parse_address(text, flag)
+    until = "until interrupted" if for_s is None else f"for {for_s:g} s"
+    return Plan("link", [], [f"pass datagrams from {listen} on to {to} {until}"], [], 0, for_s or 0)
 
 
 def impairment(way: str, given: dict[str, Any]) -> Impairment:

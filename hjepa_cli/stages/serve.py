@@ -11,6 +11,7 @@ from typing import Any
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.dashboard import Dashboard
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.plan import Plan
 from hjepa_cli.wire import auth
 from hjepa_cli.wire import metrics as prometheus
 from hjepa_cli.wire.bundle import open_bundle
@@ -83,6 +84,18 @@ def run(
         until_s = float("inf") if for_s is None else time.monotonic() + for_s
         Server(controller, opened, report, dashboard.say).run(until_s)
     return snapshot(controller, {}, time.monotonic())
+
+
+def plan(*, model: Path, bind: str, key: Path | None, for_s: float | None) -> Plan:
+    """Plan a server; arguments and errors as of :func:`run`."""
+    address = parse_address(bind, "--bind")
+    bundle = open_bundle(model)
+    if key is None or key.exists():
+        key_for(address, "--bind", key)
+    made = [] if key is None or key.exists() else [f"key {key}"]
+    until = "until interrupted" if for_s is None else f"for {for_s:g} s"
+    work = [f"drive devices of plant {bundle.plant} at {bind} {until}"]
+    return Plan("serve", [f"exported model {model}"], work, made, 32 * len(made), for_s or 0.0)
 
 
 def key_for(address: Any, flag: str, path: Path | None, *, make: bool = False) -> bytes:

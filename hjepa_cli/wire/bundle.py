@@ -116,9 +116,7 @@ def open_bundle(directory: Path) -> Bundle:
     """
     path = directory / MANIFEST
     if not path.is_file():
-        raise MissingInputError(
-            f"{directory} holds no exported model", hint=exported_by(directory)
-        )
+        raise MissingInputError(f"{directory} holds no exported model", hint=exported_by(directory))
     data = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES)
     try:
         manifest = files.parse_json(data)

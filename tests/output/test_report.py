@@ -376,13 +376,28 @@ def test_a_run_of_fusion_has_its_section(shell, without_figures):
 
 
 WIRE = {
-    **{"model": "exported", "method": "hjepa", "plant": "desktop", "seed": 3, "devices": 2},
-    **{"steps": 20, "lockstep": False, "period_ms": 7.5, "n_devices": 2, "n_steps": 20},
-    **{"score_link": 0.81, "score_link_ci95": [0.8, 0.82], "score_simulated": 0.82},
-    **{"score_simulated_ci95": [0.81, 0.83], "score_difference": -0.01234},
-    **{"score_difference_ci95": [-0.02, 0.01], "missing_share": 0.0, "late_answers_share": 0.5},
-    **{"ages": {"0": 3, "2": 3}, "sources": {"planned": 40, "held": 0}, "skipped_strides": 77},
-    **{"theta_difference_rad": {"20": 1e-6}},
+    "model": "exported",
+    "method": "hjepa",
+    "plant": "desktop",
+    "seed": 3,
+    "devices": 2,
+    "steps": 20,
+    "lockstep": False,
+    "period_ms": 7.5,
+    "n_devices": 2,
+    "n_steps": 20,
+    "score_link": 0.81,
+    "score_link_ci95": [0.8, 0.82],
+    "score_simulated": 0.82,
+    "score_simulated_ci95": [0.81, 0.83],
+    "score_difference": -0.01234,
+    "score_difference_ci95": [-0.02, 0.01],
+    "missing_share": 0.0,
+    "late_answers_share": 0.5,
+    "ages": {"0": 3, "2": 3},
+    "sources": {"planned": 40, "held": 0},
+    "skipped_strides": 77,
+    "theta_difference_rad": {"20": 1e-6},
 }
 
 
