@@ -34,7 +34,7 @@ from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets import dataset as datasets
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.networks.model import Model, build_modules, tensors_of
-from hjepa_cli.core.radio.capacity import Cell
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.duty import DUTY
 from hjepa_cli.core.radio.laws.equal import EQUAL
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement

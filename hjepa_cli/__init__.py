@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Camera": "hjepa_cli.core.plants.named",
     "CartPole": "hjepa_cli.core.plants.named",
+    "Dataset": "hjepa_cli.core.datasets.dataset",
     "Model": "hjepa_cli.core.networks.model",
     "collect": "hjepa_cli.api",
     "drive": "hjepa_cli.api",
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
         train_reflex,
     )
     from hjepa_cli.config.settings import load_settings
+    from hjepa_cli.core.datasets.dataset import Dataset
     from hjepa_cli.core.networks.model import Model
     from hjepa_cli.core.plants.named import Camera, CartPole, teacher
     from hjepa_cli.plugins import register
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Camera",
     "CartPole",
+    "Dataset",
     "Model",
     "collect",
     "drive",

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.config.checks import check_count, check_schedulable, check_uplink, resolve
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.drivers import build_driver, planner_of
 from hjepa_cli.core.control.loop import Draws, delivery_schedule, gap_schedule, simulate
@@ -30,6 +30,7 @@ from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import STAGES
 from hjepa_cli.storage import zoo
+from hjepa_cli.storage.peeking import any_of
 
 Values = Mapping[str, Any]
 
@@ -247,6 +248,7 @@ def train_reflex(
 def evaluate(
     *,
     checkpoint: str | Path | None = None,
+    dataset: str | Path | None = None,
     methods: Sequence[str] | None = None,
     out: str | Path | None = None,
     remeasure: bool = False,
@@ -254,9 +256,9 @@ def evaluate(
     config: str | Path | None = None,
     settings: Values | None = None,
 ) -> dict[str, Any]:
-    """Measure methods in closed loop, as ``hjepa eval``; return the document of ``--json``."""
+    """Measure methods in closed loop, or on recordings, as ``hjepa eval``; return the document."""
     values = _with(settings, methods=methods)
-    inputs = {"checkpoint": checkpoint, "remeasure": remeasure}
+    inputs = {"checkpoint": checkpoint, "dataset": _path(dataset), "remeasure": remeasure}
     return _call("eval", preset, config, values, out=out, **inputs)
 
 
@@ -264,6 +266,7 @@ def scale(
     *,
     snr: str | None = None,
     law: str | None = None,
+    tolerance_steps: float | None = None,
     checkpoint: str | Path | None = None,
     methods: Sequence[str] | None = None,
     out: str | Path | None = None,
@@ -274,7 +277,7 @@ def scale(
 ) -> dict[str, Any]:
     """Count the devices of a cell, as ``hjepa scale``; return the document of ``--json``."""
     values = _with(settings, **{"methods": methods, "radio.snr_db": snr, "radio.law": law})
-    inputs = {"checkpoint": checkpoint, "remeasure": remeasure}
+    inputs = {"checkpoint": checkpoint, "remeasure": remeasure, "tolerance_steps": tolerance_steps}
     return _call("scale", preset, config, values, out=out, **inputs)
 
 
@@ -289,6 +292,9 @@ def _call(
 ) -> dict[str, Any]:
     """Run a stage without notes, progress or tables: its result is returned."""
     silent = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+    named = (inputs.get(name) for name in ("dataset", "encoder", "checkpoint"))
+    if "plant" not in (values or {}) and any_of(RECORDED, named):
+        values = {**(values or {}), "plant": RECORDED}
     settings = _settings(preset, config, values)
     return STAGES[stage].run(settings, silent, out=_path(out), **inputs)
 

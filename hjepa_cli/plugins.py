@@ -1,9 +1,9 @@
 """Extensions have names: the package's own, those of installed packages, and of the user's files.
 
-Six kinds of things can be added without a change to the package: plants, codecs, schedulers,
-methods, sharing laws and stages. Each is one object, made with a class of the package, and has a
-name. Codecs and methods may be families, whose ``member(name)`` makes the extension of a name, as
-``pca-8x6``, or returns ``None`` for the names of others.
+Seven kinds of things can be added without a change to the package: plants, codecs, schedulers,
+methods, sharing laws, physical layers and stages. Each is one object, made with a class of the
+package, and has a name. Codecs and methods may be families, whose ``member(name)`` makes the
+extension of a name, as ``pca-8x6``, or returns ``None`` for the names of others.
 
 The package's own are listed in :data:`BUILT_IN` and imported when one is asked for; others
 come from an entry point of the group ``hjepa.plugins``, a module that calls :func:`register`, or
@@ -36,6 +36,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "desktop": "hjepa_cli.core.plants.cartpole.plant:DESKTOP",
         "gym": "hjepa_cli.core.plants.cartpole.plant:GYM",
         "quadrotor": "hjepa_cli.core.plants.quadrotor:QUADROTOR",
+        "recorded": "hjepa_cli.core.plants.recorded:UNKNOWN",
     },
     "scheduler": {
         "round-robin": "hjepa_cli.core.radio.schedulers.round_robin:ROUND_ROBIN",
@@ -50,6 +51,10 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "equal": "hjepa_cli.core.radio.laws.equal:EQUAL",
         "scheduled": "hjepa_cli.core.radio.laws.scheduled:SCHEDULED",
     },
+    "phy": {
+        "shannon": "hjepa_cli.core.radio.phy.shannon:SHANNON",
+        "nr": "hjepa_cli.core.radio.phy.nr:NR",
+    },
     "stage": {
         "tune-law": "hjepa_cli.stages.pipeline:TUNE_LAW",
         "collect": "hjepa_cli.stages.pipeline:COLLECT",
@@ -59,6 +64,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "train-fusion": "hjepa_cli.stages.pipeline:TRAIN_FUSION",
         "eval": "hjepa_cli.stages.pipeline:EVAL",
         "scale": "hjepa_cli.stages.pipeline:SCALE",
+        "survive": "hjepa_cli.stages.pipeline:SURVIVE",
         "reproduce": "hjepa_cli.stages.pipeline:REPRODUCE",
         "bench-link": "hjepa_cli.stages.pipeline:BENCH_LINK",
     },
@@ -101,6 +107,7 @@ CLASSES = {  # what extensions are made with, those with families too
     "scheduler": ("hjepa_cli.core.radio.schedulers.scheduler:Scheduler",),
     "method": (f"{_CONTROL}.methods.method:Method", f"{_CONTROL}.methods.method:MethodFamily"),
     "law": ("hjepa_cli.core.radio.laws.law:SharingLaw",),
+    "phy": ("hjepa_cli.core.radio.phy.phy:Phy",),
     "stage": ("hjepa_cli.stages.stage:Stage",),
 }
 
@@ -243,7 +250,7 @@ def _is_family(item: Any) -> bool:
 
 WITH_FAMILIES = tuple(kind for kind, places in CLASSES.items() if len(places) > 1)
 _REGISTRIES = {kind: Registry(kind) for kind in CLASSES}
-PLANTS, CODECS, SCHEDULERS, METHODS, LAWS, STAGES = _REGISTRIES.values()
+PLANTS, CODECS, SCHEDULERS, METHODS, LAWS, PHYS, STAGES = _REGISTRIES.values()
 
 _sources: list[Source] = []
 _loading: contextvars.ContextVar[Source | None] = contextvars.ContextVar("loading", default=None)

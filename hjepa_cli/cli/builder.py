@@ -111,7 +111,7 @@ def _explained(parameter: Any, settings: Settings) -> Any:
     if isinstance(value, float):
         value = f"{value / taken(key).unit:g}"
     elif isinstance(value, tuple):
-        value = ", ".join(value)
+        value = ", ".join(map(str, value))
     parameter.default, parameter.show_default = value, True
     if key in NAMES:
         parameter.help = parameter.help.replace("{choices}", ", ".join(NAMES[key]))

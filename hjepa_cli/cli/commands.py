@@ -18,7 +18,7 @@ from hjepa_cli.stages.stage import Imported
 
 PIPELINE, TOOLS, WIRE = "Pipeline", "Tools", "Over a wire"
 GROUPS = {
-    "data": "Describe, verify, look at and export datasets.",
+    "data": "Import, describe, verify, look at and export datasets.",
     "models": "List, describe and verify trained models.",
     "config": "Show settings.",
 }
@@ -26,7 +26,9 @@ GROUPS = {
 RESOLVED = ("preset", "config", "plant", "seed")  # what takes these is given settings
 COMPUTED = (*RESOLVED, "device")
 PARALLEL = ("workers", "cluster")
-SHARED = ("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify")  # by stages
+SHARED = (
+    *("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify", "tolerance_steps"),
+)  # by stages
 LOOP = ("methods", "protocol")
 LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss")
 MEASURED = (
@@ -109,7 +111,14 @@ def _check_cell(settings: Settings, given: Given) -> None:
 
     parse_snr(settings.radio.snr_db)
     keys = (name.partition(":")[0] for name in SCALE)
-    check_cell(settings.radio, {key: given[key] for key in keys})
+    check_cell(settings.radio, {key: given[key] for key in keys}, settings.nr)
+
+
+def _check_survival(settings: Settings, given: Given) -> None:
+    from hjepa_cli.core.radio.capacity import parse_snr
+
+    parse_snr(settings.radio.snr_db)
+    check_cell(settings.radio, nr=settings.nr)
 
 
 def _add_sources(settings: Settings, given: Given) -> None:
@@ -140,7 +149,11 @@ _LINK = tuple(
 SCALE = (
     *("radio.snr_db", "radio.law", "radio.schedulers", "radio.uncertainty", "radio.topology"),
     *("radio.bandwidth_hz", "radio.noise", "radio.power_margin_db", "radio.coherence_slots"),
-    *("radio.seeds", *MEASURED, "remeasure", "verify", "checkpoint", "dataset:clean", "out"),
+    *("radio.fading", "radio.speed_m_s", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+    *("nr.pusch_symbols", "nr.mcs_table", "nr.mcs", "nr.bler_target", "nr.link_adaptation"),
+    *("nr.cqi_age_slots", "nr.harq_rounds", "nr.grants", "nr.grants_per_slot", "nr.reports"),
+    *("radio.seeds", *MEASURED, "remeasure", "verify", "tolerance_steps", "checkpoint"),
+    *("dataset:clean", "out"),
 )
 
 
@@ -204,6 +217,17 @@ COMMANDS = (
         prepare=_figure_of_all,
     ),
     staged("scale", takes=(*SCALE, *COMPUTED, *PARALLEL), check=_check_cell),
+    staged(
+        "survive",
+        takes=(
+            *("survival.intervals_steps", "survival.loops", "survival.splitting_paths"),
+            *("survival.loss", "survival.burst_transfers", "survival.mean_time_h"),
+            *("radio.snr_db", "radio.bandwidth_hz", "radio.phy", "nr.spacing_khz", "nr.duplex"),
+            *("nr.pusch_symbols", "nr.bler_target", "nr.harq_rounds"),
+            *(*MEASURED, "checkpoint", "out", *COMPUTED, *PARALLEL),
+        ),
+        check=_check_survival,
+    ),
     Command(
         "resume",
         "Take up an interrupted run: same settings, same inputs, same result.",
@@ -255,7 +279,7 @@ COMMANDS = (
         "Drive devices over UDP with an exported model.",
         Imported("hjepa_cli.stages.serve:run"),
         (
-            *("model", "bind", "key", "max_devices", "timeout_s", "metrics", "websocket"),
+            *("model", "bind", "key:wire", "max_devices", "timeout_s", "metrics", "websocket"),
             *("backend", "for_s"),
         ),
         plan=Imported("hjepa_cli.stages.serve:plan"),
@@ -266,7 +290,7 @@ COMMANDS = (
         "Be a device: look, encode, send, and play the forces that come back.",
         Imported("hjepa_cli.stages.device:run"),
         (
-            *("model", "server", "key", "number", "camera", "crop", "actuator", "period_ms"),
+            *("model", "server", "key:wire", "number", "camera", "crop", "actuator", "period_ms"),
             *("gap_steps:wire", "innovation", "longest_steps", "watchdog_ms", "local"),
             *("stop_after_s", "steps:wire", "precision", "backend", *RESOLVED),
         ),
@@ -291,6 +315,26 @@ COMMANDS = (
         ),
         check=_one_schedule,
         panel=WIRE,
+    ),
+    Command(
+        "data import",
+        "Make a dataset of recorded pictures and actions, of a plant that hjepa does not know.",
+        Imported("hjepa_cli.stages.import_data:run"),
+        (
+            *("source", "test", "clean", "kind:import", "size", "grey", "limit"),
+            *(
+                "fps:import",
+                "action_offset",
+                "steps:import",
+                "held_out",
+                "mirror_signs",
+                "actions",
+                "states",
+            ),
+            *("expert", "camera:import", "skip_bad", "out"),
+        ),
+        plan=Imported("hjepa_cli.stages.import_data:plan"),
+        product="dataset",
     ),
     Command(
         "data info",

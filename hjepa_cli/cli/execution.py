@@ -14,11 +14,14 @@ from hjepa_cli.cli.commands import Command, Given
 from hjepa_cli.compute import memory, torchrun
 from hjepa_cli.compute.interrupts import exit_code, sigterm_raises
 from hjepa_cli.config.checks import resolve
-from hjepa_cli.config.schema import declared
+from hjepa_cli.config.schema import RECORDED, declared
 from hjepa_cli.config.settings import locate
 from hjepa_cli.errors import Interrupted, Unlocked, Unsealed, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan
+from hjepa_cli.storage.peeking import any_of
+
+NAMING = ("dataset", "encoder", "checkpoint")  # inputs that say which plant they are of
 
 
 def execute(command: Command, given: Given) -> None:
@@ -36,8 +39,10 @@ def execute(command: Command, given: Given) -> None:
             torchrun.refuse()
         if dry_run and command.plan is not None:
             plan = getattr(command.plan, "function", command.plan)
-            wanted = inspect.signature(plan).parameters.keys() & inputs.keys()
-            planned = plan(**{name: inputs[name] for name in wanted})
+            parameters = inspect.signature(plan).parameters
+            takes_all = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+            wanted = [name for name in inputs if name in parameters or takes_all]
+            planned = plan(**{name: inputs[name] for name in wanted if name != "screen"})
             if not isinstance(planned, Plan):
                 raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")
             memory.check(planned.memory_bytes, command.name)
@@ -65,6 +70,8 @@ def _placed(workers: int | None, cluster: str | None) -> AbstractContextManager[
 
 def _settings(command: Command, given: Given) -> Given:
     """Return what was given with the settings in place of what they are made of."""
+    if given["plant"] is None and any_of(RECORDED, map(given.get, NAMING)):
+        given["plant"] = RECORDED  # an input says so
     preset, config, flags = _layers(given)
     settings = resolve(preset, config, flags)
     if command.check is not None:

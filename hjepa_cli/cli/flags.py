@@ -19,7 +19,10 @@ from hjepa_cli.cli import completion
 from hjepa_cli.config.schema import (
     LARGEST,
     Count,
+    CountFromTwo,
     CountOrNone,
+    Number,
+    Positive,
     bare,
     choices_of,
     declared,
@@ -28,13 +31,14 @@ from hjepa_cli.config.schema import (
 )
 from hjepa_cli.config.settings import PRESETS, PROTOCOLS
 from hjepa_cli.errors import MissingInputError
-from hjepa_cli.plugins import LAWS, METHODS, PLANTS, SCHEDULERS
+from hjepa_cli.plugins import LAWS, METHODS, PHYS, PLANTS, SCHEDULERS
 
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
 WIRE, UPLINK, DOWNLINK = "Wire", "Uplink", "Downlink"
 SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
 PANELS = {  # of help, by section
     "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "radio": RADIO,
+    "nr": RADIO, "survival": LOOP,
     "": SETTINGS,
 }  # fmt: skip
 
@@ -44,6 +48,7 @@ NAMES: Mapping[str, Iterable[str]] = {
     "methods": METHODS,
     "radio.schedulers": SCHEDULERS,
     "radio.law": LAWS,
+    "radio.phy": PHYS,
 }
 
 
@@ -209,6 +214,87 @@ _DATA = {
         default=True,
     ),
 }
+_IMPORT = {
+    "source": _argument(
+        Path,
+        "What was recorded: a folder of pictures with a CSV, a film with a CSV beside it (or a "
+        "folder of those), NPZ, HDF5, a LeRobotDataset, or a dataset of Minari.",
+        "SOURCE",
+        default=...,
+    ),
+    "test": Input(
+        Path, "--test", "Recording for the split test. Without it: episodes held out.", "SOURCE"
+    ),
+    "clean": Input(
+        Path,
+        "--clean",
+        "Recording of the expert alone, to compare forces with. Without it: the split test.",
+        "SOURCE",
+    ),
+    "kind:import": Input(
+        Literal["folder", "video", "npz", "hdf5", "lerobot", "minari"],
+        "--format",
+        "Its format. Without it: by what lies there.",
+    ),
+    "size": Input(
+        tuple[int, int],
+        "--size",
+        "Height and width of the frames in the dataset, resized by area.",
+        "H W",
+        default=(64, 128),
+    ),
+    "grey": _switch("--grey", "Keep one channel: grey."),
+    "limit": Input(
+        tuple[Positive, ...],
+        "--limit",
+        "Limit of the actions, or of each of them separated by commas: they are stored divided by "
+        "it. Without it: what the source says.",
+        "L,…",
+    ),
+    "fps:import": Input(
+        Positive, "--fps", "Pictures per second. Without it: what the source says.", "RATE"
+    ),
+    "action_offset": Input(
+        Annotated[int, Meta(ge=-1000, le=1000)],
+        "--action-offset",
+        "Action row j + N leads from picture j to picture j + 1.",
+        default=0,
+    ),
+    "steps:import": Input(
+        CountFromTwo,
+        "--steps",
+        "Steps of the trajectories that episodes are cut into. Without it: as many as the shortest "
+        "episode has.",
+    ),
+    "held_out": Input(
+        Annotated[float, Meta(gt=0, lt=1)],
+        "--held-out",
+        "Share of the episodes for the split test; of a single one its end.",
+        "SHARE",
+        default=0.2,
+    ),
+    "mirror_signs": Input(
+        tuple[Number, ...],
+        "--mirror-signs",
+        "What mirrored pictures do to each action, 1 or -1 separated by commas, where that is true "
+        "of the plant; networks then obey it.",
+        "S,…",
+    ),
+    "actions": Input(
+        tuple[str, ...], "--actions", "Columns of actions. Without it: those called action….", "A,B"
+    ),
+    "states": Input(
+        tuple[str, ...], "--states", "Columns of states. Without it: those called state….", "A,B"
+    ),
+    "expert": Input(
+        tuple[str, ...],
+        "--expert",
+        "Columns of what an expert would do. Without it: those called expert…, else the actions.",
+        "A,B",
+    ),
+    "camera:import": Input(str, "--camera", "Which camera of a LeRobotDataset.", "NAME"),
+    "skip_bad": _switch("--skip-bad", "Leave unsound episodes out, and list them."),
+}
 _LOOP = {
     "protocol": Input(
         str,
@@ -259,6 +345,13 @@ _LOOP = {
     "live": _switch("--live", "Play in this terminal; write nothing."),
 }
 _RADIO = {
+    "tolerance_steps": Input(
+        Annotated[float, Meta(ge=1, le=LARGEST)],
+        "--tolerance-steps",
+        "Count devices whose packets may come so many control steps apart, and measure nothing: "
+        "where no closed loop exists.",
+        "STEPS",
+    ),
     "snr_db": Input(
         Annotated[float, Meta(ge=-100, le=100)],
         "--snr",
@@ -310,7 +403,7 @@ _WIRE = {
     "precision": Input(Literal["fp32", "int8"], "--precision", "Of the encoder.", default="fp32"),
     "bind": _address("--bind", "Address to serve on; port 0 takes any.", "127.0.0.1:4747"),
     "server": _address("--server", "Address of hjepa serve, or of a relay.", "127.0.0.1:4747"),
-    "key": Input(
+    "key:wire": Input(
         Path,
         "--key",
         "File with the key that server and devices share; serve makes it where there is none. "
@@ -463,8 +556,8 @@ _SETTINGS = {
     "plugin": Input(
         list[Path],
         "--plugin",
-        "Python file that adds plants, codecs, schedulers, methods, laws or stages; may be "
-        "repeated.",
+        "Python file that adds plants, codecs, schedulers, methods, laws, physical layers or "
+        "stages; may be repeated.",
         "FILE.py",
         default=[],
     ),
@@ -478,8 +571,8 @@ _SCREEN = {
 INPUTS = {
     name: dataclasses.replace(one, panel=one.panel or panel)
     for panel, listed in (
-        *((FILES, _FILES), ("", _ARGUMENTS), (DATA, _DATA), (LOOP, _LOOP), (RADIO, _RADIO)),
-        *((WIRE, _WIRE), (WIRE, _LINKS), (SETTINGS, _SETTINGS), (SCREEN, _SCREEN)),
+        *((FILES, _FILES), ("", _ARGUMENTS), (DATA, _DATA), (DATA, _IMPORT), (LOOP, _LOOP)),
+        *((RADIO, _RADIO), (WIRE, _WIRE), (WIRE, _LINKS), (SETTINGS, _SETTINGS), (SCREEN, _SCREEN)),
     )
     for name, one in listed.items()
 }
@@ -517,6 +610,11 @@ def annotation(one: Input) -> Any:
     """Return the annotated type by which Typer knows an input."""
     plain = bare(one.kind)
     words = choices_of(one.kind)
+    if plain == tuple[int, int]:  # two words of the command line
+        return Annotated[
+            plain,
+            typer.Option(one.name, help=one.help, metavar=one.metavar, rich_help_panel=one.panel),
+        ]
     how: dict[str, Any] = {
         "help": one.help,
         "metavar": one.metavar or "|".join(words) or ("N" if plain is int else None),

@@ -5,7 +5,6 @@ settings, seed and index alone, so that results do not depend on where or in whi
 may be computed twice after a failure.
 """
 
-import asyncio
 import dataclasses
 import functools
 import importlib.util
@@ -298,6 +297,8 @@ def check_answer(address: str) -> None:
     host, _, port = place.rpartition(":")
     if (sign and scheme != "tcp") or not port.isdecimal():
         return  # Dask says what is wrong with it
+    import asyncio  # it takes a while, and few commands have a cluster
+
     with ThreadPoolExecutor(1) as beside:  # here a loop of the caller's may run, as in a notebook
         begun = beside.submit(asyncio.run, _greeting(host.strip("[]"), int(port))).result()
     if begun is not None and not 0 < int.from_bytes(begun, "little") < LONGEST_GREETING:
@@ -306,6 +307,8 @@ def check_answer(address: str) -> None:
 
 async def _greeting(host: str, port: int) -> bytes | None:
     """Return the first 8 bytes that are said there, empty without; ``None`` where nobody is."""
+    import asyncio
+
     try:
         async with asyncio.timeout(CONNECT_S):
             heard, there = await asyncio.open_connection(host, port)

@@ -13,7 +13,9 @@ from types import MappingProxyType
 from typing import Any
 
 from hjepa_cli.config.schema import (
+    RECORDED,
     EncoderSettings,
+    NrSettings,
     ProtocolSettings,
     RadioSettings,
     Settings,
@@ -22,7 +24,7 @@ from hjepa_cli.config.schema import (
 )
 from hjepa_cli.config.settings import PRESETS, load_settings, locate, validated
 from hjepa_cli.errors import UsageError, meant
-from hjepa_cli.plugins import CODECS, LAWS, METHODS, PLANTS, SCHEDULERS, Registry
+from hjepa_cli.plugins import CODECS, LAWS, METHODS, PHYS, PLANTS, SCHEDULERS, Registry
 
 LATE = "+"  # between a method and the steps that its packets are late
 
@@ -36,6 +38,14 @@ TOPOLOGIES = {
     **dict.fromkeys(("radio.scenario", "radio.carrier_ghz", "radio.power_dbm"), "hall"),
     "radio.noise_figure_db": "hall",
 }
+DEFAULT_NR = NrSettings()
+# What is read of fading of some kinds only; all but "block" have a Doppler.
+DOPPLER = ("radio.speed_m_s", "radio.delay_spread_s")
+FADINGS = {
+    "radio.speed_m_s": ("jakes", "tdl"),
+    "radio.delay_spread_s": ("tdl",),
+    "radio.coherence_slots": ("block",),
+}
 UPLINK = ("radio.power_margin_db", "radio.coherence_slots", "radio.block_error")
 
 
@@ -44,7 +54,7 @@ def resolve(preset: str | None, config: Path | None, flags: Mapping[str, Any]) -
     plant = flags["plant"]
     settings = load_settings(preset, config, flags)
     held = [load_settings(settings.preset, file).plant for file in (None, config)]
-    if plant is not None and plant not in held:
+    if plant not in (None, RECORDED, *held):  # of a recorded one its dataset holds all
         other = f"--preset {plant} for plant {plant}; other values of it by --config FILE.toml"
         own = f'--config FILE.toml with plant = "{plant}" and its values'
         raise UsageError(
@@ -177,34 +187,62 @@ def _check_link(protocol: ProtocolSettings) -> None:
         )
 
 
-def check_cell(radio: RadioSettings, given: Mapping[str, object] = MappingProxyType({})) -> None:
+def check_cell(
+    radio: RadioSettings,
+    given: Mapping[str, object] = MappingProxyType({}),
+    nr: NrSettings = DEFAULT_NR,
+) -> None:
     """Raise UsageError for what was set of a cell and is not read, naming what would read it.
 
     Set is what differs from the defaults; and of ``given``, the flags by the key of their setting
-    or input, all that is neither ``None`` nor ``False``.
+    or input, all that is neither ``None`` nor ``False``. What is read must go with the rest.
     """
     flags = [key for key, value in given.items() if value not in (None, False)]
-    unlike = changed(radio)
+    unlike = changed(radio) | changed(nr, "nr")
+    aged = radio.phy == "nr" and nr.cqi_age_slots > 0
     for key in dict.fromkeys((*flags, *unlike)):
         flag = flag_of(declared()[key]) if key in declared() else None
         named = f"{key} = {unlike.get(key)!r}"
         if key in flags:
             named = flag.name if flag else f"--{key}"
-        where = None if key in flags else key
+        leave, where = f"or leave out {named}", None if key in flags else key
+        layers = [phy for phy in PHYS if key in PHYS[phy].uses]
+        if layers and radio.phy not in layers:
+            raise UsageError(
+                f"{named} is for the physical layer {' or '.join(layers)}, this is {radio.phy}",
+                hint=f"hjepa scale --phy {layers[0]} …, {leave}",
+                key=where,
+            )
         laws = [law for law in LAWS if key in LAWS[law].uses]
-        if laws and radio.law not in laws:
+        moves = aged and key in (*DOPPLER, "radio.fading", "radio.carrier_ghz")
+        if laws and radio.law not in laws and not moves:
             raise UsageError(
                 f"{named} is for the law {' or '.join(laws)}, this is {radio.law}",
-                hint=f"hjepa scale --law {laws[0]} …, or leave out {named}",
+                hint=f"hjepa scale --law {laws[0]} …, {leave}",
                 key=where,
             )
         topology = TOPOLOGIES.get(key, radio.topology)
-        if topology != radio.topology:
+        carried = key == "radio.carrier_ghz" and radio.fading != "block"
+        if topology != radio.topology and not carried:
             raise UsageError(
                 f"{named} is for the topology {topology}, this is {radio.topology}",
-                hint=f"hjepa scale --law scheduled --topology {topology} …, or leave out {named}",
+                hint=f"hjepa scale --law scheduled --topology {topology} …, {leave}",
                 key=where,
             )
+        fades = FADINGS.get(key)
+        if fades and not fits_fading(radio.fading, fades):
+            raise UsageError(
+                f"{named} is for --fading {', '.join(fades)}; this is {radio.fading}",
+                hint=f"hjepa scale --law scheduled --fading {fades[0]} …, {leave}",
+                key=where,
+            )
+    if radio.topology == "hall" and radio.fading.startswith("tdl"):
+        raise UsageError(
+            f"--fading {radio.fading} has a line of sight of its own, or none; --topology hall "
+            "draws one for each device",
+            hint="--fading jakes or block, or --topology target",
+            key="radio.fading",
+        )
     if radio.harq_rounds > 1 and radio.block_error == 0:
         raise UsageError(
             f"radio.harq_rounds = {radio.harq_rounds} is for a radio.block_error above 0; without "
@@ -212,6 +250,12 @@ def check_cell(radio: RadioSettings, given: Mapping[str, object] = MappingProxyT
             hint="set block_error in --config FILE.toml, or leave out harq_rounds",
             key="radio.harq_rounds",
         )
+    PHYS[radio.phy].check(radio, nr)
+
+
+def fits_fading(fading: str, fades: Sequence[str]) -> bool:
+    """Return whether a kind of fading is among some, of which tdl stands for all its profiles."""
+    return fading.partition("-")[0] in fades
 
 
 def check_uplink(radio: RadioSettings) -> None:
@@ -224,10 +268,10 @@ def check_uplink(radio: RadioSettings) -> None:
             )
 
 
-def changed(radio: RadioSettings) -> dict[str, Any]:
-    """Return the settings of a cell that are not as declared, by dotted key."""
-    values = {field: getattr(radio, field.name) for field in dataclasses.fields(radio)}
-    return {f"radio.{field.name}": v for field, v in values.items() if v != field.default}
+def changed(of: RadioSettings | NrSettings, section: str = "radio") -> dict[str, Any]:
+    """Return the settings of a section that are not as declared, by dotted key."""
+    values = {field: getattr(of, field.name) for field in dataclasses.fields(of)}
+    return {f"{section}.{field.name}": v for field, v in values.items() if v != field.default}
 
 
 def check_schedulable(methods: Sequence[str], steps: int) -> None:

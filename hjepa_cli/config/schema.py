@@ -17,6 +17,7 @@ from msgspec import Meta
 
 LARGEST = sys.float_info.max  # bounds what is not bounded otherwise: no infinity, no NaN
 LARGEST_SEED = 2**63 - 1
+RECORDED = "recorded"  # the plant of imported datasets
 CARRIER_GHZ = (0.5, 100.0)  # validity of TR 38.901, clause 7.4
 
 MOST = 10**9  # of anything: beyond what any machine holds or any program counts
@@ -31,6 +32,8 @@ NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 GreyLevels = Annotated[float, Meta(ge=0, le=255)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+SidePx = Annotated[int, Meta(ge=16, le=1024)]  # of a picture
+Sign = Annotated[float, Meta(ge=-1, le=1)]
 Candidates = Annotated[int, Meta(ge=4, le=10_000)]  # of a round of CMA-ES
 Delay = Annotated[int, Meta(ge=0, le=256)]  # a controller remembers what it sent in 512 steps
 
@@ -53,6 +56,37 @@ class Flag:
 
 
 STRIDE_H = Flag("--h", "Stride of the high level in control steps, a multiple of m.")
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraSettings:
+    """Frames have this size in datasets and networks; a dataset brings its own along.
+
+    Simulated cameras take 64 × 128 and are resized by area.
+    """
+
+    height_px: SidePx = 64
+    width_px: SidePx = 128
+    grey: bool = False
+
+    @property
+    def frame_shape(self) -> tuple[int, int, int]:
+        """Return (H, W, C), with one channel for grey and three for colours."""
+        return self.height_px, self.width_px, 1 if self.grey else 3
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedSettings:
+    """A plant that only recordings are known of is what their dataset says of it.
+
+    Actions are stored ÷ ``limits``; ``mirror`` has a factor for each, 1 or −1, where mirrored
+    pictures show a plant that mirrored actions move alike, and is empty where they do not.
+    """
+
+    step_s: Positive = 0.02
+    limits: tuple[Positive, ...] = (1.0,)
+    states: tuple[str, ...] = ()
+    mirror: tuple[Sign, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -360,6 +394,14 @@ class RadioSettings:
             "or as a scheduler decides.",
         ),
     ] = "duty"
+    phy: Annotated[
+        str,
+        Flag(
+            "--phy",
+            "What a slot carries: Shannon's capacity, or a 5G NR uplink with what it costs "
+            "(extra nr).",
+        ),
+    ] = "shannon"
     snr_db: Annotated[
         str,
         Flag(
@@ -407,6 +449,18 @@ class RadioSettings:
             "DB",
         ),
     ] = 10.0
+    fading: Annotated[
+        Literal["block", "jakes", "tdl-a", "tdl-b", "tdl-c", "tdl-d", "tdl-e"],
+        Flag(
+            "--fading",
+            "A new fade every so many slots, or one with a Doppler: flat, or a tapped delay line "
+            "of TR 38.901 (extra nr).",
+        ),
+    ] = "block"
+    speed_m_s: Annotated[
+        Positive, Flag("--speed-m-s", "Speed of a device, of fading with a Doppler.", "M/S")
+    ] = 1.0
+    delay_spread_s: Annotated[float, Meta(gt=0, le=1e-5)] = 50e-9  # rms, of a tapped delay line
     coherence_slots: Annotated[
         float,
         Meta(ge=1, le=LARGEST),
@@ -436,8 +490,127 @@ class RadioSettings:
 
     @property
     def load_depends_on_snr(self) -> bool:
-        """Return whether it does under law scheduled: by margins in a hall, or by repetitions."""
-        return self.topology == "hall" or (self.harq_rounds > 1 and self.block_error > 0)
+        """Return whether it does under law scheduled: by margins in a hall, or by block errors."""
+        by_errors = self.phy != "shannon" or (self.harq_rounds > 1 and self.block_error > 0)
+        return self.topology == "hall" or by_errors
+
+
+@dataclasses.dataclass(frozen=True)
+class NrSettings:
+    """The uplink of ``--phy nr`` is configured so: one layer of PUSCH, DFT-s-OFDM, FR1."""
+
+    spacing_khz: Annotated[
+        int,
+        Meta(ge=15, le=60),
+        Flag("--scs", "PHY nr: subcarrier spacing in kHz: 15, 30, 60.", "KHZ"),
+    ] = 30
+    duplex: Annotated[
+        str,
+        Flag(
+            "--duplex",
+            "PHY nr: FDD, or a TDD pattern of slots D, S and U like DDDSU.",
+            "FDD|PATTERN",
+        ),
+    ] = "FDD"
+    pusch_symbols: Annotated[
+        int,
+        Meta(ge=4, le=14),
+        Flag("--pusch-symbols", "PHY nr: symbols of a packet's PUSCH (mapping type B)."),
+    ] = 14
+    dmrs_additional: Annotated[int, Meta(ge=0, le=3)] = 1  # positions besides the first symbol
+    mcs_table: Annotated[
+        int,
+        Meta(ge=1, le=2),
+        Flag("--mcs-table", "PHY nr: table 6.1.4.1-1 or -2 (low rates) of TS 38.214."),
+    ] = 1
+    mcs: Annotated[
+        int,
+        Meta(ge=-1, le=27),
+        Flag("--mcs", "PHY nr: this MCS whatever the SNR; -1 adapts it to the link."),
+    ] = -1
+    bler_target: Annotated[
+        float,
+        Meta(ge=1e-5, le=0.5),
+        Flag("--bler-target", "PHY nr: block error rate that link adaptation may come to.", "P"),
+    ] = 0.1
+    # "outer": the mean error rate meets the target although the channel knowledge has aged.
+    link_adaptation: Annotated[
+        Literal["inner", "outer"],
+        Flag(
+            "--link-adaptation",
+            "PHY nr: by the SNR that was reported, or corrected by what really gets lost.",
+        ),
+    ] = "inner"
+    cqi_age_slots: Annotated[
+        float,
+        Meta(ge=0, le=1e4),
+        Flag(
+            "--cqi-age-slots",
+            "PHY nr: age of the channel knowledge, in slots of the carrier; needs a Doppler.",
+            "SLOTS",
+        ),
+    ] = 0.0
+    # Copies of a transport block that are combined; 1: a lost packet is replaced by the newest.
+    harq_rounds: Annotated[
+        int,
+        Meta(ge=1, le=16),
+        Flag("--harq-rounds", "PHY nr: transmissions of a block that are combined; 1: none."),
+    ] = 1
+    harq_rtt_slots: Annotated[int, Meta(ge=1, le=32)] = 4  # from one of them to the next
+    grants: Annotated[
+        Literal["configured", "dynamic"],
+        Flag(
+            "--grants",
+            "PHY nr: grants configured in advance where devices take turns, or each signalled.",
+        ),
+    ] = "configured"
+    grants_per_slot: Annotated[
+        Count, Flag("--grants-per-slot", "PHY nr: dynamic grants that a slot can signal.")
+    ] = 16
+    reports: Annotated[
+        Literal["sr", "pucch", "grant", "free"],
+        Flag(
+            "--reports",
+            "PHY nr: what innovation reports go by: scheduling requests, 2 bits of PUCCH, small "
+            "configured grants that devices contend for, or free of cost.",
+        ),
+    ] = "sr"
+    header_bits: CountOrNone = 40  # MAC subheader 16, RLC UM 8, PDCP 16
+
+
+@dataclasses.dataclass(frozen=True)
+class SurvivalSettings:
+    """``survive`` silences loops so, and asks so much of links."""
+
+    intervals_steps: Annotated[
+        tuple[Count, ...],
+        Flag("--intervals", "Control steps between packets in time, separated by commas.", "N,N"),
+    ] = (10, 40)
+    loops: Annotated[Count, Flag("--loops", "Loops through each silence.")] = 256
+    splitting_paths: Annotated[
+        CountOrNone,
+        Flag("--splitting", "Paths for losses of 1 in 10,000; 0: a bound from what was counted."),
+    ] = 128
+    loss: Annotated[
+        float,
+        Meta(gt=0, lt=0.5),
+        Flag(
+            "--loss", "Share of transfers that a link loses, to tell how long control lasts.", "P"
+        ),
+    ] = 1e-3
+    burst_transfers: Annotated[
+        float,
+        Meta(ge=1, le=1e4),
+        Flag(
+            "--burst-transfers",
+            "Mean transfers in a run of losses, where they come in bursts.",
+            "N",
+        ),
+    ] = 4.0
+    mean_time_h: Annotated[
+        Positive,
+        Flag("--mean-time-hours", "Mean time between losses of control to be reached.", "HOURS"),
+    ] = 8760.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -462,6 +635,8 @@ class Settings:
     control: ControlSettings = ControlSettings()
     tune: TuneSettings = TuneSettings()
     fusion: FusionSettings = FusionSettings()
+    camera: CameraSettings = CameraSettings()
+    recorded: RecordedSettings = RecordedSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
     actor: ActorSettings = ActorSettings()
@@ -470,12 +645,15 @@ class Settings:
     protocol: ProtocolSettings = ProtocolSettings()
     conditions: ConditionSettings = ConditionSettings()
     radio: RadioSettings = RadioSettings()
+    nr: NrSettings = NrSettings()
+    survival: SurvivalSettings = SurvivalSettings()
 
     def as_dict(self) -> dict[str, Any]:
         """Return nested plain data, ready for JSON (tuples become lists).
 
-        Empty lists and the zeros of an ideal link are left out: they stand for values that say the
-        same, and digests of settings stay what they were before there were such settings.
+        Empty lists, the zeros of an ideal link, the usual camera and what only recorded plants
+        have are left out: they stand for values that say the same, and digests of settings stay
+        what they were before there were such settings.
         """
         values = _without_empty(plain(dataclasses.asdict(self)))
         for key in IDEAL_LINK:
@@ -483,6 +661,10 @@ class Settings:
                 del values["protocol"][key]
         if not values["control"]:
             del values["control"]
+        if self.camera == CameraSettings():
+            del values["camera"]
+        if self.plant != RECORDED:
+            del values["recorded"]
         return values
 
 

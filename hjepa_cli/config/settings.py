@@ -29,7 +29,7 @@ from hjepa_cli.config.schema import (
     plain,
 )
 from hjepa_cli.errors import DataError, MissingInputError, UsageError, choices
-from hjepa_cli.plugins import LAWS, PLANTS, read_regular
+from hjepa_cli.plugins import LAWS, PHYS, PLANTS, read_regular
 
 _FOLDER = resources.files("hjepa_cli.config") / "presets"
 _CONTROL_LAWS = resources.files("hjepa_cli.config") / "control_laws.toml"
@@ -120,7 +120,7 @@ def validated(values: Mapping[str, Any]) -> Settings:
     except msgspec.ValidationError as error:
         path = str(error).rpartition("`$.")[2].rstrip("`")  # as protocol.gaps[1]
     else:
-        for key, names in (("plant", PLANTS), ("radio.law", LAWS)):
+        for key, names in (("plant", PLANTS), ("radio.law", LAWS), ("radio.phy", PHYS)):
             if (value := operator.attrgetter(key)(settings)) not in names:
                 known = choices(value, names, "choose one of")
                 raise UsageError(f"{key} = {value!r}; {known}", key=key)

@@ -105,6 +105,35 @@ def devices_figure(
 
 
 @matplotlib.rc_context(RC)
+def survival_figure(result: Mapping[str, Any], *, title: str = "") -> Figure:
+    """Draw the curves of ``survive --json``: the share of loops lost against the gap.
+
+    Points in which none was lost lie at the lower edge, with their interval.
+    """
+    figure, axes = _panel()
+    step_ms, loops = 1e3 * result["step_s"], result["n_loops"]
+    floor = 0.3 / loops
+    methods = list(dict.fromkeys(curve["method"] for curve in result["curves"]))
+    several = len({curve["interval_steps"] for curve in result["curves"]}) > 1
+    for curve in result["curves"]:
+        gaps_ms = np.array([point["gap_steps"] * step_ms for point in curve["points"]])
+        lost = np.array([point["p_lost"] for point in curve["points"]])
+        ends = np.array([point["p_lost_ci95"] for point in curve["points"]])
+        label = curve["method"]
+        if several:
+            label += f", every {curve['interval_steps'] * step_ms:g} ms"
+        shown = np.maximum(lost, floor)
+        draw_line(axes, curve["method"], methods, gaps_ms, shown, ends, label, scale=1.0)
+    axes.set_yscale("log")
+    axes.set_ylim(floor, 1.5)
+    axes.set_xlabel("Gap between two packets (ms)")
+    axes.set_ylabel("Loops lost")
+    axes.set_title(title)
+    _finish(figure, axes)
+    return figure
+
+
+@matplotlib.rc_context(RC)
 def schedulers_figure(rows: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
     """Draw rows of ``scale --law scheduled --json``: devices against the SNR, a panel per method.
 

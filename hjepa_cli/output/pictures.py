@@ -1,9 +1,11 @@
 """Camera frames become contact sheets and animations, with Pillow (extra ``plot``)."""
 
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from hjepa_cli.core.arrays import Pixels
@@ -20,7 +22,14 @@ def font(size_px: int = 10) -> "ImageFont.FreeTypeFont | ImageFont.ImageFont":
 
 
 def contact_sheet(frames: Pixels, labels: Sequence[Sequence[str]]) -> Image.Image:
-    """Lay frames uint8 [rows, columns, H, W, 3] out in a grid, labels [rows][columns] above."""
+    """Lay frames uint8 [rows, columns, H, W, C] out in a grid, labels [rows][columns] above.
+
+    Frames that are narrower than the longest label are enlarged.
+    """
+    longest_px = max(font().getlength(text) for texts in labels for text in texts)
+    times = max(math.ceil(longest_px / frames.shape[3]), 1)
+    frames = frames.repeat(times, axis=2).repeat(times, axis=3)
+    frames = np.broadcast_to(frames, (*frames.shape[:-1], 3))  # of grey ones too
     rows, columns, height, width, _ = frames.shape
     step = (width + MARGIN_PX, height + LABEL_PX + MARGIN_PX)
     size = (columns * step[0] + MARGIN_PX, rows * step[1] + MARGIN_PX)

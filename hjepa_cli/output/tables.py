@@ -1,5 +1,6 @@
 """Tables show what a training stage or an evaluation found."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hjepa_cli.core.control.force_error import WINDOWS
@@ -118,5 +119,92 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
     screen.say(result["source"])
 
 
+def show_offline(result: dict[str, Any], screen: Screen) -> None:
+    """Print what recordings say of each method: its error, and how long that is small."""
+    entries = result["methods"]
+    first = next(iter(entries.values()))
+    windows = list(first["nmae_windows"])
+    within = list(first["steps_within"])
+    where = f"split {result['split']} of {result['dataset']}"
+    screen.table(
+        f"{where}: NMAE by steps since the packet, with every packet, and steps until it exceeds a "
+        f"share of the range ({first['n_rollouts']} trajectories)",
+        ["method", *windows, "every", *(f"≤ {most}" for most in within), "bits"],
+        [
+            [
+                name,
+                *(_number(entry["nmae_windows"][window], 4) for window in windows),
+                _number(entry["nmae_every_step"], 4),
+                *(str(entry["steps_within"][most]) for most in within),
+                entry["bits_per_transmission"],
+            ]
+            for name, entry in entries.items()
+        ],
+    )
+    rows = []
+    for name, of in result["latent"].items():
+        last = len(of["steps"]) - 1
+        for at in sorted({0, last // 2, last} - {-1}):
+            rows.append(
+                [
+                    *(name, str(of["steps"][at]), _number(of["error"][at], 4)),
+                    _number(of["still"][at], 4),
+                ]
+            )
+    if rows:
+        screen.table(
+            f"{where}: 1 − cos of predicted and seen embeddings under the recorded actions",
+            ["method", "steps", "predicted", "nothing changes"],
+            rows,
+        )
+    if result["probe_r2"]:
+        probes = result["probe_r2"]
+        screen.table(
+            "states read off embeddings, held out",
+            [*probes],
+            [[_number(value, 3) for value in probes.values()]],
+        )
+    else:
+        screen.say("no states were recorded: probes are absent")
+    screen.say(
+        "recordings say nothing of closed loops; hjepa scale --tolerance-steps STEPS counts the "
+        "devices of a gap that you take to be safe"
+    )
+
+
 def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
+
+
+ALLOCATION = (  # of rows of ``scale --json`` under a physical layer with transport blocks
+    *("mcs", "modulation_order", "code_rate", "prbs", "data_symbols", "dmrs_re_per_prb"),
+    *("tbs_bits", "segments", "bler", "grants", "packets_per_slot", "latency_s"),
+)
+
+
+def show_allocations(rows: Sequence[Mapping[str, Any]], screen: Screen) -> None:
+    """Print what a packet is sent on, once for each size, SNR and kind of grant."""
+    found = {
+        (row["bits_per_transmission"], row["snr_db"], row["grants"]): row
+        for row in rows
+        if "mcs" in row
+    }
+    if not found:
+        return
+    screen.table(
+        "what a packet takes; packets get through per slot of the loop",
+        [
+            *("bits", "SNR [dB]", "grants", "MCS", "Qm", "R", "PRBs", "symbols", "TBS [bits]"),
+            *("blocks", "BLER", "packets", "latency [ms]"),
+        ],
+        [
+            [
+                *(bits, f"{snr_db:g}", grants, row["mcs"], row["modulation_order"]),
+                *(f"{row['code_rate']:.3f}", row["prbs"], row["data_symbols"], row["tbs_bits"]),
+                row["segments"],
+                f"{'≤ ' if row['bler_is_bound'] else ''}{row['bler']:.4f}",
+                *(f"{row['packets_per_slot']:.1f}", f"{row['latency_s'] * 1e3:.2f}"),
+            ]
+            for (bits, snr_db, grants), row in sorted(found.items())
+        ],
+    )

@@ -16,11 +16,11 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
 from hjepa_cli.stages.frame_training import fit
-from hjepa_cli.stages.inputs import embed
+from hjepa_cli.stages.inputs import embed, pictures
 from hjepa_cli.stages.training import TrainingRun
 
 LOOK_EVERY = 4  # steps between the held-out frames that watch training
@@ -36,6 +36,7 @@ def describe_architecture(settings: Settings) -> dict[str, Any]:
         **{name: getattr(encoder, name) for name in recorded},
         "actor_hidden": actor.hidden,
         "actor_dropout": actor.dropout,
+        **pictures(settings),
     }
 
 
@@ -61,7 +62,7 @@ def examine(
 ) -> dict[str, Any]:
     """Return the health of what the actor listens to, and of the actor; there is no predictor."""
     train_z, test_z = (_read(networks, split, settings, every=1) for split in (train, test))
-    names, states = plant(settings.plant).state_names, (train.states_at(1), test.states_at(1))
+    names, states = plant_of(settings).state_names, (train.states_at(1), test.states_at(1))
     report = {
         "probe_r2": health.probe_r2(train_z, states[0], test_z, states[1], names),
         "effective_rank": health.effective_rank(test_z),

@@ -154,7 +154,7 @@ def run(
         runtime = Runtime(bundle, backend)
         runtime.warm_up("encoder", "actor")
         moved = actual_plant(settings.plant, settings.conditions)
-        camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+        camera = actual_camera(settings)
         fleet = Fleet(
             *(bundle, runtime, moved, camera, draws, sent, NO_KEY, period_s),
             local=harm is not None,

@@ -21,7 +21,7 @@ from hjepa_cli.core.evaluation.load_simulator import (
 from hjepa_cli.core.evaluation.simulator import Tick, silent
 from hjepa_cli.core.evaluation.workers import Workers
 from hjepa_cli.core.plants.conditions import actual_plant
-from hjepa_cli.core.radio.capacity import Cell
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.scheduled import ScheduledBand, SupportedLoad
 from hjepa_cli.output.screen import Screen, ticking
@@ -40,8 +40,8 @@ class BlockLoads:
         self._settings = models.settings
         radio, protocol = self._settings.radio, self._settings.protocol
         kind = actual_plant(self._settings.plant, self._settings.conditions)
-        cell = Cell.of(radio, kind)
-        self._band = ScheduledBand(cell, radio, protocol.acceptable_score)
+        cell = Cell.of(self._settings, kind)
+        self._band = ScheduledBand(cell, protocol.acceptable_score)
         self._seeds = range(self._settings.seed, self._settings.seed + radio.seeds)
         self._load_steps = BLOCK_DEVICES * protocol.total_steps  # device-steps of a load, about
         self._bits: dict[str, int] = {}
@@ -57,7 +57,7 @@ class BlockLoads:
         keys = dict.fromkeys(
             self._key(*link)
             for link in itertools.product(methods, schedulers, grid_db)
-            if self._fits(link[0], link[2])
+            if self._fits(*link)
         )
         # The longest first: devices that report look at what they see in every slot.
         jobs = sorted(keys, key=lambda key: not SCHEDULERS[key[1]].wants_reports)
@@ -70,7 +70,7 @@ class BlockLoads:
     def row(self, name: str, scheduler: str, snr_db: float) -> Row:
         """Count one method's devices under one scheduler at one SNR."""
         key = self._key(name, scheduler, snr_db)
-        found = self._loads[key] if self._fits(name, snr_db) else None
+        found = self._loads[key] if self._fits(name, scheduler, snr_db) else None
         row = self._band.row(found, name, scheduler, self._bits[name], snr_db)
         if self._settings.radio.topology != "hall":
             return row
@@ -133,5 +133,5 @@ class BlockLoads:
         """Return the key that a load is kept under: it is often the same at every SNR."""
         return name, scheduler, snr_db if self._settings.radio.load_depends_on_snr else 0.0
 
-    def _fits(self, name: str, snr_db: float) -> bool:
-        return self._band.fits(self._bits[name], snr_db)
+    def _fits(self, name: str, scheduler: str, snr_db: float) -> bool:
+        return self._band.fits(scheduler, self._bits[name], snr_db)

@@ -18,7 +18,7 @@ from hjepa_cli.compute import memory
 from hjepa_cli.compute.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.config.checks import check_settings
-from hjepa_cli.config.schema import Settings, dotted
+from hjepa_cli.config.schema import RECORDED, Settings, dotted
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import (
     MANIFEST,
@@ -31,8 +31,8 @@ from hjepa_cli.core.datasets.dataset import (
 )
 from hjepa_cli.core.datasets.trajectories import generate, split_sizes
 from hjepa_cli.core.plants.conditions import altered
-from hjepa_cli.core.plants.frames import FRAME_BITS, HEIGHT_PX, WIDTH_PX, frames_of
-from hjepa_cli.core.plants.named import plant, plant_of
+from hjepa_cli.core.plants.frames import frame_bits, frames_of
+from hjepa_cli.core.plants.named import camera_of, plant, plant_of
 from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import PLANTS
@@ -56,6 +56,7 @@ from hjepa_cli.storage.shards import (
     remove_log,
 )
 
+OWN = ("control", "camera")  # what a dataset brings along for all that is done with it
 FRAMES_PER_SAMPLE = 2  # κ: current and previous
 TOGETHER = 20  # trajectories rendered at a time; the sample is one such batch
 WORTH_WORKERS = 4_000_000  # simulated steps; below, processes cost more than they bring
@@ -75,15 +76,14 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     """
     check(settings)
     started = time.perf_counter()
-    camera = plant_of(settings).camera()
+    camera = camera_of(plant_of(settings), settings.camera)
     definition: dict[str, Any] = {
         "seed": settings.seed,
         "collect": settings.as_dict()["collect"] | {"plant": settings.plant},
     }
     if conditions := altered(settings.as_dict()):  # clean rollouts are of such devices
         definition["conditions"] = conditions
-    if control := settings.as_dict().get("control"):
-        definition["control"] = control
+    definition |= {key: value for key, value in settings.as_dict().items() if key in OWN}
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
             return describe_finished(directory, screen, settings.plant, definition)
@@ -108,7 +108,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             )
             remove_log(directory)
     result = describe(data, time.perf_counter() - started, frames_per_s)
-    bits = FRAMES_PER_SAMPLE * FRAME_BITS
+    bits = FRAMES_PER_SAMPLE * frame_bits(settings.camera.frame_shape)
     screen.say(
         f"{result['trajectories']} training trajectories in {result['seconds']:.1f} s: "
         f"{result['dataset']}; as raw frames the training phase takes "
@@ -137,7 +137,9 @@ def plan(settings: Settings, *, out: Path | None = None) -> Plan:
         f"{options.clean_trajectories} clean trajectories of plant {settings.plant} ({steps} steps)"
     ]
     if frames:
-        work.append(f"render {frames} frames of {HEIGHT_PX} x {WIDTH_PX} RGB")
+        height_px, width_px, channels = settings.camera.frame_shape
+        colours = "RGB" if channels == 3 else "grey"
+        work.append(f"render {frames} frames of {height_px} x {width_px} {colours}")
     directory = out or f"data/{settings.plant}-<next number>"
     return Plan(
         command="collect",
@@ -223,6 +225,11 @@ def recorded_settings(directory: Path) -> Settings:
 def check(settings: Settings) -> None:
     """Raise UsageError where sizes make no dataset, naming the setting."""
     check_settings(settings)
+    if settings.plant == RECORDED:
+        raise UsageError(
+            "a recorded plant is not simulated; its datasets are imported",
+            hint="hjepa data import SOURCE",
+        )
     total = sum(count for count, _ in split_sizes(settings.collect).values())
     most = MAX_SHARDS * per_shard(settings.collect.frames == "stored")
     if total > most:
@@ -274,18 +281,18 @@ def make_shard(
     """Do a unit of parallel work: decided by its arguments, written atomically, so repeatable."""
     made = generate(settings, shard.split, range(shard.start, shard.stop))
     if settings.collect.frames == "stored":
-        made = dataclasses.replace(
-            made, frames=frames_of(plant(settings.plant).camera(), made.states, TOGETHER)
-        )
+        camera = camera_of(plant(settings.plant), settings.camera)
+        made = dataclasses.replace(made, frames=frames_of(camera, made.states, TOGETHER))
     with holding(directory, which):
-        return write_shard(directory, shard, made, settings.plant)
+        return write_shard(directory, shard, made, settings.plant, settings.as_dict())
 
 
 def size_bytes(settings: Settings) -> int:
     """Return what the dataset takes on disk, without headers."""
     kind = plant(settings.plant)
     state_bytes, force_bytes = 4 * len(kind.state_names), 8 * math.prod(kind.action_shape)
-    frame_bytes = HEIGHT_PX * WIDTH_PX * 3 * (settings.collect.frames == "stored")
+    stored = settings.collect.frames == "stored"
+    frame_bytes = stored * frame_bits(settings.camera.frame_shape) // 8
     return sum(
         count * ((steps + 1) * (state_bytes + frame_bytes) + force_bytes * steps)
         for count, steps in split_sizes(settings.collect).values()
@@ -298,7 +305,7 @@ def memory_bytes(settings: Settings) -> int:
     states, forces = len(kind.state_names), math.prod(kind.action_shape)
     stored = collect.frames == "stored"
     row_bytes = 8 * (states + 4 * forces) + 8 * (states + 2 * forces)
-    row_bytes += 2 * HEIGHT_PX * WIDTH_PX * 3 * stored
+    row_bytes += 2 * frame_bits(settings.camera.frame_shape) // 8 * stored
     return max(
         min(count, per_shard(stored)) * (steps + 1) * row_bytes
         for count, steps in split_sizes(collect).values()
@@ -316,9 +323,9 @@ def describe(data: Dataset, seconds: float, frames_per_s: float | None) -> dict[
         "dataset": str(data.path),
         "trajectories": count,
         "test_trajectories": counts["test"],
-        "clean_trajectories": counts["clean"],
+        "clean_trajectories": counts.get("clean", 0),
         "steps": steps,
         "seconds": round(seconds, 3),
         "frames_per_s": None if frames_per_s is None else round(frames_per_s, 1),
-        "training_uplink_bits": count * steps * FRAMES_PER_SAMPLE * FRAME_BITS,
+        "training_uplink_bits": count * steps * FRAMES_PER_SAMPLE * frame_bits(data.frame_shape),
     }

@@ -179,6 +179,8 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
 
 def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
     """Say why a run cannot be compared with others, if anything is wrong with it."""
+    if result.get("offline"):
+        return "it was measured on recordings, without closed loops to compare"
     try:
         msgspec.convert(result, _Result)
         msgspec.convert(config, _Config)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.compute import memory
+from hjepa_cli.config.schema import RECORDED
 from hjepa_cli.core.datasets import exports
 from hjepa_cli.core.datasets.dataset import (
     MANIFEST,
@@ -17,8 +18,10 @@ from hjepa_cli.core.datasets.dataset import (
     load_dataset,
 )
 from hjepa_cli.core.plants.control_law import control_law, control_of
-from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, frames_of
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.named import camera_in, camera_of
+from hjepa_cli.core.plants.recorded import Recorded
+from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.errors import HjepaError, MissingInputError, UsageError, require
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan, seconds_of, size
@@ -38,7 +41,7 @@ def show_info(screen: Screen, path: Path | None) -> Result:
     result = summary(data)
     rows = {
         "plant": data.plant,
-        "seed": data.settings.get("seed"),
+        **({} if data.plant == RECORDED else {"seed": data.settings.get("seed")}),
         "frames": data.frames,
         "camera version": data.camera.get("version"),
         "on disk": size(result["size_bytes"]),
@@ -49,6 +52,9 @@ def show_info(screen: Screen, path: Path | None) -> Result:
         rows[name] = f"{trajectories} in {split['shards']} shards"
     collected = data.settings.get("collect", {})
     rows |= {f"collect.{key}": value for key, value in collected.items() if key != "plant"}
+    for section in ("recorded", "camera", "import"):
+        said = data.settings.get(section, {})
+        rows |= {f"{section}.{key}": _shown(value) for key, value in said.items()}
     screen.table(f"Dataset {data.path}", ["", "value"], list(rows.items()))
     return {**result, "config": data.settings, "camera": data.camera}
 
@@ -80,7 +86,7 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
         verified.append({**summary(data), "states": ranges})
         screen.table(
             f"{path}: intact, sha256 {data.digest}",
-            ["split", *labels(data.plant)],
+            ["split", *labels(data.kind)],
             [
                 [name, *(f"{least:.3g} … {most:.3g}" for least, most in spans)]
                 for name, spans in ranges.items()
@@ -113,11 +119,12 @@ def preview(
     recorded = data.split(split)[:rows]
     steps = np.linspace(0, recorded.steps - 1, min(columns, recorded.steps)).round().astype(int)
     if recorded.frames is None:
-        frames = frames_of(plant(data.plant).camera(), recorded.states[:, steps + 1])
+        frames = frames_of(data_camera(data), recorded.states[:, steps + 1])
     else:
         frames = recorded.frames[:, steps + 1]
+    kind, driven_n = data.kind, recorded.applied_n
     captions = [
-        [f"{split} {row}, k {step}, {forces(recorded.applied_n[row, step])}" for step in steps]
+        [f"{split} {row}, k {step}, {forces(driven_n[row, step], kind)}" for step in steps]
         for row in range(len(recorded))
     ]
     target = files.target(out or Path(f"{data.path.name}-{split}.png"))
@@ -138,10 +145,14 @@ def export(
     memory.check(held_bytes(data, split), f"split '{split}' of {data.path}")
     recorded = data.split(split)
     target = files.target(out or Path(f"{data.path.name}-{split}{FORMATS[kind][0]}"))
-    system = plant(data.plant)
-    limit_n, camera = system.force_limit_n, system.camera()
-    act = control_law(system, control_of(data.settings, data.path))
-    values = exports.columns(recorded, act(recorded.states[:, 0]), limit_n)
+    system = data.kind
+    limit_n, camera = system.force_limit_n, data_camera(data)
+    if data.plant == RECORDED:  # nobody knows what the expert would have done before
+        before_n = np.zeros_like(recorded.teacher_n[:, 0])
+    else:
+        act = control_law(system, control_of(data.settings, data.path))
+        before_n = act(recorded.states[:, 0])
+    values = exports.columns(recorded, before_n, limit_n)
     about = {
         "dataset": data.digest,
         "plant": data.plant,
@@ -149,6 +160,8 @@ def export(
         "camera": data.camera,
         "force_limit_n": limit_n,
         "step_s": system.step_s,
+        "states": list(system.state_names),
+        "actions": math.prod(system.action_shape),
     }
 
     def film(part: Trajectories) -> np.ndarray:
@@ -159,9 +172,9 @@ def export(
         if not pixels:  # nothing that takes time
             bar.advance(len(recorded))
         if kind == "hdf5":
-            exports.write_hdf5(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
+            exports.write_hdf5(target, values, filmed, data.frame_shape, about)
         else:
-            exports.write_npz(target, values, filmed, (HEIGHT_PX, WIDTH_PX, 3), about)
+            exports.write_npz(target, values, filmed, data.frame_shape, about)
     names = sorted([*values, *(["pixels"] if pixels else [])])
     screen.say(f"{len(recorded)} trajectories, {', '.join(names)}: {target}")
     return {
@@ -169,7 +182,7 @@ def export(
         "split": split,
         "file": str(target),
         "format": kind,
-        "rows": len(values["state"]),
+        "rows": len(values["action"]),
         "columns": names,
         "size_bytes": target.stat().st_size,
     }
@@ -214,18 +227,37 @@ def spread(split: Trajectories) -> list[list[float]]:
     return [[float(values.min()), float(values.max())] for values in series]
 
 
-def labels(plant_name: str) -> list[str]:
-    """Return the names of what :func:`spread` is of: ``x [m]``, …, ``force [N]``."""
-    system = plant(plant_name)
+def labels(system: System) -> list[str]:
+    """Return the names of what :func:`spread` is of: ``x [m]``, …, ``force [N]``.
+
+    Of a recorded plant states have no units, and actions are in ± 1.
+    """
     states = zip(system.state_names, system.state_units, strict=True)
+    named = [f"{name} [{unit}]" if unit else name for name, unit in states]
     count = math.prod(system.action_shape)
     numbers = [""] if count == 1 else [f" {number}" for number in range(1, count + 1)]
-    return [*(f"{name} [{unit}]" for name, unit in states), *(f"force{n} [N]" for n in numbers)]
+    force = "action{}" if isinstance(system, Recorded) else "force{} [N]"
+    return [*named, *(force.format(number) for number in numbers)]
 
 
-def forces(applied_n: np.ndarray) -> str:
-    """Return a step's forces as ``+1.5 N``, or ``+0.2 -0.1 N`` where there are several forces."""
+def forces(applied_n: np.ndarray, system: System) -> str:
+    """Return a step's forces as ``+1.5 N``, or ``+0.2 -0.1 N`` where there are several forces.
+
+    Of a recorded plant they are its actions as they were recorded.
+    """
+    if isinstance(system, Recorded):
+        return " ".join(f"{action:+.3g}" for action in applied_n.reshape(-1) * system.limits)
     return " ".join(f"{force:+.1f}" for force in applied_n.reshape(-1)) + " N"
+
+
+def data_camera(data: Dataset) -> Camera:
+    """Return the camera that a dataset's pictures are of."""
+    return camera_of(data.kind, camera_in(data.settings))
+
+
+def _shown(value: object) -> object:
+    """Return a list as text between commas."""
+    return ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
 
 
 def chosen_format(out: Path | None, kind: str | None) -> str:
@@ -252,9 +284,9 @@ def chosen_format(out: Path | None, kind: str | None) -> str:
 def held_bytes(data: Dataset, split: str) -> int:
     """Return what an export holds at once: the split twice while it is read, then its columns."""
     described = data.splits.get(split, {"trajectories": 0, "steps": 0})
-    system = plant(data.plant)
+    system = data.kind
     row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
-    stored_bytes = HEIGHT_PX * WIDTH_PX * 3 * (data.frames == "stored")
+    stored_bytes = math.prod(data.frame_shape) * (data.frames == "stored")
     return described["trajectories"] * (described["steps"] + 1) * (4 * row_bytes + 2 * stored_bytes)
 
 
@@ -268,7 +300,7 @@ def plan_export(
         data.split(split)  # says so
     described = data.splits[split]
     rows = described["trajectories"] * (described["steps"] + 1)
-    system = plant(data.plant)
+    system = data.kind
     row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
     frames = rows if pixels else 0
     work = [f"gather {rows} rows of split {split}"]

@@ -19,7 +19,7 @@ from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks.model import Model, tensors_of
 from hjepa_cli.core.plants.control_law import control_law
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, fit_actor
 from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
@@ -37,7 +37,7 @@ def begin(
 ) -> nn.ModuleDict:
     """Return new networks, but for those ``taken`` from others; the encoder is frozen."""
     torch.manual_seed(settings.seed)
-    modules = untrained(architecture, settings.plant)
+    modules = untrained(architecture, settings)
     for name in taken:
         modules[name].load_state_dict(trained[name].state_dict())
     modules["encoder"].requires_grad_(False).eval()
@@ -60,7 +60,7 @@ def embed_all(
     In a copy every trajectory is moved sideways by up to ``encoder.shift_px``, and the labels are
     what the teacher does there. With ``flip`` all of these are there in the mirror too.
     """
-    device, kind, count = resolve_device(settings.device), plant(settings.plant), len(train.frames)
+    device, kind, count = resolve_device(settings.device), plant_of(settings), len(train.frames)
     act, mirror = control_law(kind, settings.control), torch.tensor(kind.mirror)
     teach = labels_of(train, kind, act)
     every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
@@ -134,7 +134,7 @@ def fit_actor_to(
         labels,
         dataclasses.replace(settings.actor, hidden=hidden, dropout=dropout),
         seed=settings.seed,
-        mirror=plant(settings.plant).force_signs if exact else None,
+        mirror=plant_of(settings).force_signs if exact else None,
     )
     modules[name].load_state_dict(fitted.state_dict())
     modules[name].eval()
@@ -149,12 +149,13 @@ def save(run: TrainingRun, modules: nn.ModuleDict, metadata: dict[str, Any]) -> 
 def nmae_windows(model: Model, method: str, data: Dataset, settings: Settings) -> dict[str, float]:
     """Return how far a method's forces are from the teacher's after one packet, by windows.
 
-    Both are on the clean rollouts; the error is ÷ the force range.
+    Both are on the clean rollouts, or on what was held out of recordings; the error is ÷ the force
+    range.
     """
-    clean = data.split("clean")
+    clean = data.split(data.rollouts)
     errors = control_errors(
         build_driver(method, settings, model),
-        clean.states.astype(float),
+        clean.states.astype(float) if data.frames == "rendered" else clean.frames,
         clean.teacher_n.astype(float),
         model.force_limit_n,
         min(settings.protocol.horizon, clean.steps - 1),

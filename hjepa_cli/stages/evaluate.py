@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.checks import check_gaps, check_methods
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen, in_order
 from hjepa_cli.output.tables import show_evaluation
-from hjepa_cli.stages import results
+from hjepa_cli.stages import evaluate_offline, results
 from hjepa_cli.stages.measuring import curves_for, plan_curves
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -50,6 +50,10 @@ def run(
             matplotlib for ``figure``.
         DataError: a damaged file, one of another plant, or a figure of models of different seeds.
     """
+    if settings.plant == RECORDED:
+        refuse_closed_loop(remeasure=remeasure, figure=figure)
+        found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}
+        return evaluate_offline.run(settings, screen, **found)
     models = open_measurable(settings, screen, checkpoint, dataset, further, figure=figure)
     inputs = models.inputs(remeasure=remeasure, figure=figure)
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
@@ -78,6 +82,10 @@ def plan(
     figure: bool = False,
 ) -> Plan:
     """Plan the loops of the methods whose curves are not there yet; arguments as of :func:`run`."""
+    if settings.plant == RECORDED:
+        refuse_closed_loop(remeasure=remeasure, figure=figure)
+        found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}
+        return evaluate_offline.plan(settings, **found)
     quiet = Screen(quiet=True)
     models = open_measurable(settings, quiet, checkpoint, dataset, further, figure=figure)
     measured = models.measurable(settings.methods)
@@ -90,6 +98,16 @@ def plan(
         writes_bytes=200_000,
         seconds=5 + seconds,
     )
+
+
+def refuse_closed_loop(**flags: bool) -> None:
+    """Raise UsageError for flags about closed loops, where there are recordings alone."""
+    for name, given in flags.items():
+        if given:
+            raise UsageError(
+                f"--{name} is about closed loops; a recorded plant has none",
+                hint="hjepa eval --dataset DIR without it",
+            )
 
 
 def reads_of(models: ModelSet) -> list[str]:

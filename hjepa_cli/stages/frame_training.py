@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.core.plants.control_law import control_law
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.batches import FrameWindows
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.core.training.jepa import Jepa
@@ -34,7 +34,7 @@ def fit(
         NumericalError: training diverged.
         Interrupted: the state is saved.
     """
-    options, ranks, kind = run.settings.encoder, run.ranks, plant(run.settings.plant)
+    options, ranks, kind = run.settings.encoder, run.ranks, plant_of(run.settings)
     optimiser = Optimiser(
         objective.parameters(),
         name=options.optimizer,
@@ -59,7 +59,7 @@ def fit(
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories
     share = ranks.share(count)
     part = (share.stop - share.start) / count  # 1 on a single process
-    epoch_steps = max(train.states[..., 0].numel() // (count * windows.window_frames), 1)
+    epoch_steps = max(train.actions.shape[:2].numel() // (count * windows.window_frames), 1)
     terms: dict[str, Tensor] = {}
 
     def draw() -> Drawn:

@@ -1,15 +1,18 @@
 """Training reads frames and embeddings of a dataset here."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from hjepa_cli.compute.device import resolve_device
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import RECORDED, CameraSettings, RecordedSettings, Settings
 from hjepa_cli.core.datasets.dataset import (
     Dataset,
     Trajectories,
@@ -19,12 +22,13 @@ from hjepa_cli.core.datasets.dataset import (
 from hjepa_cli.core.datasets.trajectories import split_sizes
 from hjepa_cli.core.networks.model import encode_frames
 from hjepa_cli.core.plants.conditions import vary
+from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.frames import frames_of
-from hjepa_cli.core.plants.named import plant, plant_of
+from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, plant_of
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.core.training.batches import shift_sideways
 from hjepa_cli.core.training.rendered import RenderedSplit
-from hjepa_cli.errors import DataError, MissingInputError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen
 
 CHUNK = 20  # trajectories rendered or encoded at a time: progress shows, memory stays small
@@ -73,12 +77,14 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
     kind = plant_of(settings)
     path = path or find_newest_dataset(Path("data"), settings.plant)
     if path is None:
+        made_by = f"hjepa collect --plant {settings.plant}"
         raise MissingInputError(
             f"no dataset of plant {settings.plant} below data/",
-            hint=f"hjepa collect --plant {settings.plant}, or pass --dataset DIR",
+            hint=f"{'hjepa data import SOURCE' if settings.plant == RECORDED else made_by}, "
+            "or pass --dataset DIR",
         )
     data = load_dataset(path, settings.plant)
-    if not same_camera(data.camera, kind):
+    if not same_camera(data.camera, camera_of(kind, camera_in(data.settings))):
         raise DataError(
             f"dataset {path} was collected with another camera than plant {kind.name} has now",
             hint=f"hjepa collect --plant {kind.name}",
@@ -86,14 +92,79 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
     return data
 
 
+def brought_along(settings: Settings, record: Mapping[str, Any], where: object) -> Settings:
+    """Return settings with what a dataset or a checkpoint, ``where``, brings along in its own.
+
+    That is the law, the size of pictures and, of a recorded plant, all that is known of it. Unless
+    that says what a mirror does, networks do not commute with one; and nobody knows what its
+    pictures show when they are moved.
+
+    Raises:
+        DataError: it holds no valid law.
+    """
+    settings = dataclasses.replace(
+        settings, control=control_of(record, where), camera=camera_in(record)
+    )
+    if settings.plant != RECORDED:
+        return settings
+    known = msgspec.convert(record["recorded"], RecordedSettings)
+    mirror = settings.encoder.mirror if known.mirror else "none"
+    encoder = dataclasses.replace(settings.encoder, mirror=mirror, shift_px=0)
+    return dataclasses.replace(settings, recorded=known, encoder=encoder)
+
+
+def refuse_recorded(settings: Settings, why: str) -> None:
+    """Raise UsageError for a recorded plant in a stage that needs equations; ``why`` says so."""
+    if settings.plant == RECORDED:
+        raise UsageError(
+            f"{why}; a recorded plant has no equations",
+            hint="hjepa eval --dataset DIR compares methods that need none",
+        )
+
+
+def check_same_plant(metadata: Mapping[str, Any], settings: Settings, what: str) -> None:
+    """Raise DataError where a checkpoint is of another plant, or of other pictures, than settings.
+
+    ``what`` names the checkpoint.
+    """
+    theirs = metadata["plant"]
+    if theirs != settings.plant:
+        raise DataError(
+            f"{what} was trained on plant {theirs}, the dataset is of plant {settings.plant}",
+            hint=f"hjepa train-encoder --plant {settings.plant}",
+        )
+    size = camera_in(metadata["settings"])
+    if size != settings.camera:
+        raise DataError(
+            f"{what} was trained on pictures of {shown(size)}, "
+            f"the dataset has {shown(settings.camera)}",
+            hint="hjepa train-encoder with this dataset",
+        )
+    if theirs == RECORDED and plant_in(theirs, metadata["settings"]) != plant_of(settings):
+        raise DataError(
+            f"{what} was trained on recordings of another plant than the dataset has",
+            hint="hjepa train-encoder with this dataset",
+        )
+
+
+def pictures(settings: Settings) -> dict[str, Any]:
+    """Return what an architecture says of the size of pictures: nothing of the usual one."""
+    return {key: value for key, value in settings.as_dict().items() if key == "camera"}
+
+
+def shown(size: CameraSettings) -> str:
+    """Return ``"64 × 128 px"``, and whether they are grey."""
+    return f"{size.height_px} × {size.width_px} px" + ", grey" * size.grey
+
+
 def render(
     trajectories: Trajectories, settings: Settings, screen: Screen, split: str = "train"
 ) -> RenderedSplit:
     """Return a split, rendered now unless the dataset stores frames, in varied light and noise."""
-    kind = plant(settings.plant)
+    kind = plant_of(settings)
     limit_n, frames = kind.force_limit_n, trajectories.frames
     if frames is None:
-        camera = kind.camera()
+        camera = camera_of(kind, settings.camera)
         count = len(trajectories)
         parts = []
         with screen.progress("render", count, "trajectories") as bar:

@@ -12,22 +12,22 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.checks import needs_model, split_late, without_model
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.control.drivers import methods_of, offered_methods
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.workers import ModelFile
 from hjepa_cli.core.networks.model import Model
-from hjepa_cli.core.plants.control_law import control_of
-from hjepa_cli.core.plants.named import plant, plant_of
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS
-from hjepa_cli.stages.inputs import open_dataset
+from hjepa_cli.stages.inputs import brought_along, check_same_plant, open_dataset
 from hjepa_cli.storage import runs, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 from hjepa_cli.storage.zoo import CURVES_FILE
 
+ALIKE = ("plant", "recorded")  # what a model must have in common with what it is to drive
 TRAINING = ("train-encoder", "train-hierarchy", "train-reflex", "train-fusion")
 
 
@@ -170,6 +170,8 @@ def open_model_set(
             hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
         )
     if model:
+        if settings.plant == RECORDED and dataset:
+            check_same_plant(model.metadata, settings, f"model {path}")
         settings = under_law_of(model, settings)
     data = open_dataset(dataset, settings) if dataset else None
     first = ModelSet(settings, model, path, data)
@@ -193,9 +195,8 @@ def open_model_set(
 
 
 def under_law_of(model: Model, settings: Settings) -> Settings:
-    """Return settings with the law that a model learned, for all that is compared with it."""
-    control = control_of(model.metadata["settings"], model.digest)
-    return dataclasses.replace(settings, control=control)
+    """Return settings with the law that a model learned, and its pictures, for all beside it."""
+    return brought_along(settings, model.metadata["settings"], model.digest)
 
 
 def how_to_train(method: str, settings: Settings) -> str:
@@ -209,10 +210,13 @@ def default_model(settings: Settings, screen: Screen) -> Path | None:
     Of the zoo the model with the settings' strides, if there is one.
     """
 
+    mine = settings.as_dict()
+
     def fits(directory: Path, several: bool) -> bool:
         config = runs.read_config(directory)
         strides = {config.get("hierarchy", {}).get(name) for name in ("h", "m", "l")}
-        return config.get("plant") == settings.plant and (len(strides) > 1 or not several)
+        alike = all(config.get(key) == mine.get(key) for key in ALIKE)
+        return alike and (len(strides) > 1 or not several)
 
     for several in (True, False):
         directory = runs.newest_run(
@@ -250,8 +254,10 @@ def _find(
         held: tuple[str, ...] = ()
         with contextlib.suppress(HjepaError, KeyError, TypeError):  # damaged ones hold nothing
             metadata = load_checkpoint(path).metadata
+            if settings.plant == RECORDED:
+                check_same_plant(metadata, settings, str(path))
             if metadata["plant"] == settings.plant and seed in (None, metadata.get("seed")):
-                held = offered_methods(metadata["architecture"], plant(settings.plant))
+                held = offered_methods(metadata["architecture"], plant_of(settings))
         if taken := [name for name in missing if name in held]:
             found.append(path)
             screen.say(f"{', '.join(taken)}: model {path}")

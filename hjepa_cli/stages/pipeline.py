@@ -62,7 +62,13 @@ SCALE = _stage(
     "scale",
     "Count the devices that one radio cell supports, by method and signal-to-noise ratio.",
     "scale",
-    inputs=("checkpoint", "further", "dataset", "remeasure", "verify"),
+    inputs=("checkpoint", "further", "dataset", "remeasure", "verify", "tolerance_steps"),
+)
+SURVIVE = _stage(
+    "survive",
+    "Measure how long loops go on without expected packets, and what links that takes.",
+    "survive",
+    inputs=("checkpoint", "further"),
 )
 REPRODUCE = _stage(
     "reproduce", "Run all stages into one folder and write the report.", "reproduce",

@@ -15,7 +15,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template, UndefinedError
 
 from hjepa_cli import __version__
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant, plant_in
 from hjepa_cli.errors import MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
 from hjepa_cli.stages import results
@@ -26,13 +26,8 @@ Figures = dict[str, tuple[str, Any]]
 """File name without suffix → caption and figure."""
 
 STAGES = (
-    "train-encoder",
-    "train-hierarchy",
-    "train-reflex",
-    "train-fusion",
-    "eval",
-    "scale",
-    "bench-link",
+    *("train-encoder", "train-hierarchy", "train-reflex", "train-fusion"),
+    *("eval", "scale", "survive", "bench-link"),
 )
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
@@ -169,6 +164,8 @@ def inputs_of(environment: Mapping[str, Any]) -> list[str]:
             path = Path(given["path"])
             here = path.is_relative_to(Path.cwd())
             flags += [f"--{name}", str(path.relative_to(Path.cwd()) if here else path)]
+        elif isinstance(given, float):
+            flags += [f"--{name.replace('_', '-')}", f"{given:g}"]
     return flags
 
 
@@ -222,7 +219,7 @@ def write_figures(drawn: Figures, directory: Path, run: str, formats: Sequence[s
 
 def gates(result: Result, config: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return the gates of an encoder by name, those of the states first and in their order."""
-    states = [f"probe_r2_{name}" for name in plant(config["plant"]).state_names]
+    states = [f"probe_r2_{name}" for name in plant_in(config["plant"], config).state_names]
     return list(in_order(result["gates"], states).items())
 
 
@@ -260,6 +257,9 @@ def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path
     from hjepa_cli.output import figures
 
     entries = in_order(result["methods"], config["methods"])
+    if result.get("offline"):
+        text = "Error of the predicted force after a single packet, on recordings, 95 % bands"
+        return {"error": (text, figures.error_figure(entries, step_s=result["step_s"]))}
     step_s = plant(result["plant"]).step_s
     acceptable = config["protocol"]["acceptable_score"]
     drawn = {
@@ -282,6 +282,14 @@ def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Pat
     return {"devices": (caption, figures.scale_figure(result))}
 
 
+def survival_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+    """Draw the share of loops that a gap loses."""
+    from hjepa_cli.output import figures
+
+    caption = "Loops lost in a single gap between packets, 95 % Clopper-Pearson intervals"
+    return {"survival": (caption, figures.survival_figure(result))}
+
+
 def wire_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
     """Draw how late answers came and where forces came from."""
     from hjepa_cli.output import figures
@@ -294,5 +302,6 @@ FIGURES: dict[str, Callable[..., Figures]] = {
     **{stage: training_figures for stage in STAGES if stage.startswith("train-")},
     "eval": eval_figures,
     "scale": scale_figures,
+    "survive": survival_figures,
     "bench-link": wire_figures,
 }

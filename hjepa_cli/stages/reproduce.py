@@ -142,7 +142,7 @@ def check(settings: Settings) -> None:
     check_horizon(settings.protocol.horizon, collected.clean_steps)
     check_gaps(settings.protocol)
     parse_snr(settings.radio.snr_db)
-    check_cell(settings.radio)
+    check_cell(settings.radio, nr=settings.nr)
 
 
 def left_out(settings: Settings) -> list[str]:

@@ -22,6 +22,7 @@ LARGEST = 1e100  # bounds beyond anything that is measured keep arithmetic in ra
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=1e-100, le=LARGEST)]
+Probability = Annotated[float, Meta(ge=0, le=1)]
 Whole = Annotated[int, Meta(ge=0, le=10**18)]
 Interval = tuple[NotNegative, NotNegative]
 Windows = dict[str, Number | None]
@@ -65,7 +66,7 @@ class _Row(msgspec.Struct):
     tolerance_ci95: Interval | None = None
     delay_steps: NotNegative | None = 0
     reports_per_block_slot: NotNegative | None = None
-    coverage: Annotated[float, Meta(ge=0, le=1)] | None = None
+    coverage: Probability | None = None
 
 
 class _Gain(msgspec.Struct):
@@ -113,6 +114,36 @@ class _Evaluation(msgspec.Struct):
     source: str = ""
 
 
+class _OfflineEntry(msgspec.Struct):
+    n_rollouts: Whole
+    nmae: list[NotNegative]
+    nmae_ci95: list[Interval]
+    nmae_windows: Windows
+    nmae_every_step: NotNegative | None
+    steps_within: dict[str, Whole]
+    bits_per_transmission: NotNegative
+
+
+class _Latent(msgspec.Struct):
+    steps: list[Whole]
+    error: list[Number]
+    still: list[Number]
+
+
+class _Offline(msgspec.Struct):
+    """What ``eval`` says of a recorded plant."""
+
+    plant: str
+    seed: Whole
+    step_s: Positive
+    checkpoint: str | None
+    dataset: str
+    split: str
+    methods: Annotated[dict[str, _OfflineEntry], Meta(min_length=1)]
+    latent: dict[str, _Latent]
+    probe_r2: Windows
+
+
 class _Scale(msgspec.Struct):
     rows: Annotated[list[_Row], Meta(min_length=1)]
     seed: Whole
@@ -125,6 +156,49 @@ class _Scale(msgspec.Struct):
     paper_gain_percent: Number
     gains: list[_Gain]
     csv: str = ""
+    figures: list[str] = []
+
+
+class _Lost(msgspec.Struct):
+    gap_steps: Positive
+    p_lost: Probability
+    p_lost_ci95: tuple[Probability, Probability]
+    p_left_band: Probability
+    back_steps_median: NotNegative | None
+    back_steps_p95: NotNegative | None
+
+
+class _Losses(msgspec.Struct):
+    method: str
+    interval_steps: Positive
+    points: Annotated[list[_Lost], Meta(min_length=1)]
+
+
+class _SurvivalTime(msgspec.Struct):
+    method: str
+    transfer_interval_s: Positive
+    loss_probability: Probability
+    how: str
+    at_least: bool
+    survival_steps: NotNegative
+    survival_ci95: tuple[NotNegative, NotNegative | None]
+    tolerance_gap_steps: NotNegative | None
+    availability: Probability | None
+    tolerated_loss: Probability
+    tolerated_loss_bursts: Probability
+    devices: Whole
+
+
+class _Survival(msgspec.Struct):
+    plant: str
+    seed: Whole
+    step_s: Positive
+    n_loops: Annotated[int, Meta(ge=1, le=10**18)]
+    phy: str
+    bandwidth_hz: Positive
+    mean_time_h: Positive
+    rows: Annotated[list[_SurvivalTime], Meta(min_length=1)]
+    curves: Annotated[list[_Losses], Meta(min_length=1)]
     figures: list[str] = []
 
 
@@ -162,6 +236,7 @@ RESULTS = {
     "train-fusion": _Fusion,
     "eval": _Evaluation,
     "scale": _Scale,
+    "survive": _Survival,
     "bench-link": _Wire,
 }
 
@@ -218,10 +293,13 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     """Return what keeps a result from being shown, if anything."""
     if stage not in RESULTS:
         return "its stage is none of ours"
+    offline = stage == "eval" and bool(result.get("offline"))
     try:
-        msgspec.convert(result, RESULTS[stage])
+        msgspec.convert(result, _Offline if offline else RESULTS[stage])
     except msgspec.ValidationError as error:
         return str(error)
+    if offline:
+        return _offline_flaw(result)
     if stage == "eval":
         entries = result["methods"]
         former = {"tolerance_gap_lq_steps": None}  # which older ones lack
@@ -242,6 +320,20 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     return None
 
 
+def _offline_flaw(result: Mapping[str, Any]) -> str | None:
+    """Return what keeps an evaluation on recordings from being shown, if anything."""
+    entries = result["methods"]
+    for name, entry in entries.items():
+        if len(entry["nmae"]) != len(entry["nmae_ci95"]):
+            return f"method '{name}': its errors and their intervals are not as many"
+    for name, of in result["latent"].items():
+        if not len(of["steps"]) == len(of["error"]) == len(of["still"]):
+            return f"latent of '{name}': its lists are not equally long"
+    return _unlike("methods", [entry["nmae_windows"] for entry in entries.values()]) or _unlike(
+        "methods", [entry["steps_within"] for entry in entries.values()]
+    )
+
+
 def _unlike(what: str, windows: list[dict[str, Any]]) -> str | None:
-    """Return the complaint where not all have the same windows of steps."""
+    """Return the complaint where not all have the same keys, windows of steps as a rule."""
     return f"its {what} have different windows" if len({*map(frozenset, windows)}) > 1 else None

@@ -15,6 +15,7 @@ from hjepa_cli.core.datasets.dataset import MANIFEST
 from hjepa_cli.errors import DataError, MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import STAGES
+from hjepa_cli.stages import import_data
 from hjepa_cli.stages.collect import describe_finished, recorded_settings
 from hjepa_cli.stages.plan import Plan
 from hjepa_cli.stages.stage import Stage
@@ -41,6 +42,9 @@ def run(directory: Path, screen: Screen) -> dict[str, Any]:
     if (directory / MANIFEST).exists():
         torchrun.refuse()
         return describe_finished(directory, screen)
+    if (directory / LOG).exists() and import_data.is_import(directory):
+        torchrun.refuse()
+        return import_data.resume(directory, screen)
     stage, settings, inputs = recall(directory, screen)
     if not stage.shared:
         torchrun.refuse()

@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.checks import check_cell
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES, MAX_BISECTIONS, MAX_WIDENINGS
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.capacity import parse_snr
+from hjepa_cli.core.radio.doppler import check_speed
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
+from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.output.tables import ALLOCATION, show_allocations
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.stages import results
 from hjepa_cli.stages.evaluate import reads_of
@@ -27,6 +30,7 @@ from hjepa_cli.stages.measuring import plan_curves, seconds_of_loops
 from hjepa_cli.stages.plan import Plan, run_directory
 from hjepa_cli.stages.scale_by_formula import ByFormula, described
 from hjepa_cli.stages.scale_by_simulation import BySimulation
+from hjepa_cli.stages.scale_by_tolerance import ByTolerance
 from hjepa_cli.stages.verification import enforce
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
@@ -45,6 +49,7 @@ def run(
     remeasure: bool = False,
     verify: bool = False,
     further: Sequence[Path] | None = None,
+    tolerance_steps: float | None = None,
 ) -> dict[str, Any]:
     """Count devices; return the document of ``--json``.
 
@@ -58,6 +63,8 @@ def run(
         remeasure: do not use cached curves.
         verify: drive loops a little inside and outside of what was found, now.
         further: models of methods that the first one does not hold; ``None`` looks for them.
+        tolerance_steps: count devices whose packets may come so many steps apart, and measure
+            nothing: where there is no closed loop.
 
     Raises:
         UsageError: bad SNR grid or method, or radio values that the law does not read.
@@ -65,11 +72,13 @@ def run(
         DataError: a damaged checkpoint, or one of another plant.
         NumericalError: ``verify`` does not confirm what was found.
     """
-    radio, kind = settings.radio, plant(settings.plant)
+    radio, kind = settings.radio, plant_of(settings)
     grid_db = parse_snr(radio.snr_db)
-    check_cell(radio, {"remeasure": remeasure})
-    count = counting(settings, screen, checkpoint, dataset, further)
-    given = {"verify": verify}
+    check_cell(radio, {"remeasure": remeasure}, settings.nr)
+    count = counting(settings, screen, checkpoint, dataset, further, tolerance_steps)
+    given: dict[str, Any] = {"verify": verify}
+    if tolerance_steps is not None:
+        given["tolerance_steps"] = tolerance_steps
     if "remeasure" in LAWS[radio.law].uses:
         given["remeasure"] = remeasure
     with Run.create("scale", out, settings.as_dict(), count.models.inputs(**given)) as record:
@@ -84,6 +93,8 @@ def run(
                 "acceptable_score": settings.protocol.acceptable_score,
                 "link": link.facts(settings.protocol, len(kind.force_signs)),
                 "law": radio.law,
+                "phy": radio.phy,
+                **({} if radio.phy == "shannon" else {"nr": settings.as_dict()["nr"]}),
                 "bandwidth_hz": radio.bandwidth_hz,
                 "slot_s": kind.step_s,
                 "limit_bits_per_s": kind.data_rate_limit_bits_per_s,
@@ -97,6 +108,7 @@ def run(
             result = record.finish(result)
         with results.showing("scale", recorded, record.directory):
             count.show(result)
+            show_allocations(result["rows"], screen)
             screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
             enforce(result)
         return result
@@ -111,12 +123,14 @@ def plan(
     remeasure: bool = False,
     verify: bool = False,
     further: Sequence[Path] | None = None,
+    tolerance_steps: float | None = None,
 ) -> Plan:
     """Plan a count of devices; arguments as of :func:`run`."""
     radio, protocol = settings.radio, settings.protocol
     grid_db = parse_snr(radio.snr_db)
-    check_cell(radio, {"remeasure": remeasure})
-    count = counting(settings, Screen(quiet=True), checkpoint, dataset, further)
+    check_cell(radio, {"remeasure": remeasure}, settings.nr)
+    quiet = Screen(quiet=True)
+    count = counting(settings, quiet, checkpoint, dataset, further, tolerance_steps)
     if isinstance(count, BySimulation):
         reads = [f"model {count.models.name}"]
         work, seconds = plan_searches(settings, count.methods, verify=verify)
@@ -169,9 +183,24 @@ def counting(
     checkpoint: str | Path | None = None,
     dataset: Path | None = None,
     further: Sequence[Path] | None = None,
+    tolerance_steps: float | None = None,
 ) -> ByFormula | BySimulation:
     """Open what is to be counted under the law of the settings; arguments as of :func:`run`."""
-    law = LAWS[settings.radio.law]
+    law, radio = LAWS[settings.radio.law], settings.radio
+    if tolerance_steps is not None:
+        if not isinstance(law, ClosedFormLaw):
+            raise UsageError(
+                f"--tolerance-steps is for a law with a formula; {settings.radio.law} simulates",
+                hint="hjepa scale --law duty --tolerance-steps STEPS",
+            )
+        return ByTolerance(law, settings, screen, tolerance_steps, checkpoint)
+    if settings.plant == RECORDED:
+        raise UsageError(
+            "a recorded plant has no closed loop to measure a tolerance in",
+            hint="hjepa scale --tolerance-steps STEPS; hjepa eval says how forces err with time",
+        )
+    if radio.fading != "block":
+        check_speed(radio.speed_m_s, radio.carrier_ghz, plant_of(settings).step_s)
     if isinstance(law, ClosedFormLaw):
         return ByFormula(law, settings, screen, checkpoint, dataset, further)
     return BySimulation(settings, screen, checkpoint, further)
@@ -180,6 +209,8 @@ def counting(
 def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> Path:
     """Write the rows in long format: a line per SNR and method, units in the header."""
     text = io.StringIO()
+    if any("mcs" in row for row in rows):
+        columns = (*columns, *ALLOCATION)
     table = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     table.writeheader()
     for row in rows:

@@ -9,15 +9,15 @@ from hjepa_cli.config.checks import late
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control import link
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
-from hjepa_cli.core.plants.frames import FRAME_BITS
-from hjepa_cli.core.plants.named import plant
-from hjepa_cli.core.radio.capacity import Cell
+from hjepa_cli.core.plants.frames import frame_bits
+from hjepa_cli.core.plants.named import plant_of
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.output.screen import Screen, described_steps, percent, span
-from hjepa_cli.plugins import LAWS, METHODS
+from hjepa_cli.plugins import LAWS, METHODS, PHYS
 from hjepa_cli.stages.evaluate import open_measurable
 from hjepa_cli.stages.measuring import curves_for, measure_points
 from hjepa_cli.stages.verification import VERIFY_AT, show_verdicts, verdict
@@ -43,7 +43,7 @@ class ByFormula:
     ) -> None:
         self.models = open_measurable(settings, screen, checkpoint, dataset, further)
         self._law, self._settings, self._screen = law, settings, screen
-        self._cell = Cell.of(settings.radio, plant(settings.plant))
+        self._cell = Cell.of(settings, plant_of(settings))
 
     def measured_methods(self, grid_db: Sequence[float]) -> dict[float, list[str]]:
         """Return by SNR the methods that can be measured, late where the law makes them so.
@@ -101,9 +101,7 @@ class ByFormula:
             for row in reversed(rows)
         }
         screen.table(
-            f"one {result['plant']} loop at score {result['acceptable_score']:g}: seed "
-            f"{result['seed']}, {result['n_devices']} devices, {described_steps(result)}, 95 % CI; "
-            f"limit λ/ln 2 = {result['limit_bits_per_s']:.1f} bit/s",
+            self.loop_title(result),
             ["method", axis.label, "bits", "bit/s", "÷limit"],
             [
                 [
@@ -136,11 +134,19 @@ class ByFormula:
                 screen.say(f"{method} at {row['snr_db']:g} dB: {row['reason']}")
         screen.say(result["source"])
 
+    def loop_title(self, result: Mapping[str, Any]) -> str:
+        """Return the title of the table of what a loop needs."""
+        return (
+            f"one {result['plant']} loop at score {result['acceptable_score']:g}: seed "
+            f"{result['seed']}, {result['n_devices']} devices, {described_steps(result)}, 95 % CI; "
+            f"limit λ/ln 2 = {result['limit_bits_per_s']:.1f} bit/s"
+        )
+
     def _in_time(self, method: str, snr_db: float) -> str:
         if METHODS[method].sends != "frames":
             return method
-        bits = int(method.rpartition("-")[2]) * FRAME_BITS
-        forces = len(plant(self._settings.plant).force_signs)
+        bits = int(method.rpartition("-")[2]) * frame_bits(self._settings.camera.frame_shape)
+        forces = len(plant_of(self._settings).force_signs)
         bits += link.confirmation_bits(self._settings.protocol, forces)
         delay_slots = self._law.asked("delay_slots", self._cell.link(bits, snr_db))
         return late(method, math.ceil(delay_slots * (1 - ROUNDING)))
@@ -174,6 +180,8 @@ def described(result: Mapping[str, Any]) -> str:
     law = f"{result['law']} law{link.described(result.get('link', {}))}"
     if result.get("noise") == "scaled" and "radio.noise" in LAWS[result["law"]].uses:
         law += ", scaled noise"
+    if (phy := result.get("phy", "shannon")) != "shannon":
+        law += f", {PHYS[phy].help}" if phy in PHYS else f", {phy}"
     return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
 
 

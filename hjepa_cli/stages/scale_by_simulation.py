@@ -23,6 +23,7 @@ from hjepa_cli.output.screen import Screen, span
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.block_loads import BlockLoads
 from hjepa_cli.stages.model_set import open_model_set
+from hjepa_cli.stages.scale_by_formula import described
 from hjepa_cli.stages.verification import show_verdicts
 from hjepa_cli.storage.runs import Run
 
@@ -43,7 +44,7 @@ class BySimulation:
     columns = (
         *("snr_db", "method", "scheduler", "devices", "devices_ci95_low", "devices_ci95_high"),
         *("at_least", "load_per_block", "bits_per_s", "ratio_to_limit", "bits_per_transmission"),
-        *("packets_per_block_slot", "reports_per_block_slot", "reason"),
+        *("packets_per_block_slot", "reports_per_block_slot", "reports_share", "reason"),
     )
 
     def __init__(
@@ -87,6 +88,8 @@ class BySimulation:
             "topology": radio.topology,
             "power_margin_db": radio.power_margin_db if radio.topology == "target" else None,
             "coherence_slots": radio.coherence_slots,
+            "fading": radio.fading,
+            "speed_m_s": None if radio.fading == "block" else radio.speed_m_s,
             "overhead_bits": radio.overhead_bits,
             "block_error": radio.block_error,
             "harq_rounds": radio.harq_rounds,
@@ -153,10 +156,11 @@ class BySimulation:
             if result["topology"] == "target"
             else "devices in a hall"
         )
+        fades = f"coherence {result['coherence_slots']:g} slots"
+        if result["fading"] != "block":
+            fades = f"{result['fading']} at {result['speed_m_s']:g} m/s"
         screen.table(
-            f"devices: scheduled law, payload {result['payload']}, "
-            f"{result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots, {links}, "
-            f"coherence {result['coherence_slots']:g} slots",
+            f"devices: {described(result)}, payload {result['payload']}, {links}, {fades}",
             ["method, scheduler", *(f"{snr_db:g} dB" for snr_db in grid_db)],
             [
                 [label, *(_span(count[label, at], "devices", "devices_ci95", 0) for at in grid_db)]

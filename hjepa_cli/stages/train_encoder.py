@@ -5,6 +5,7 @@ trajectories, look at the representation's health every epoch, and let the stage
 whether the result is worth handing on. The baselines are in :mod:`hjepa_cli.stages.baselines`.
 """
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,12 @@ import torch
 from torch import nn
 
 from hjepa_cli.compute.device import resolve_device
-from hjepa_cli.config.schema import Settings, dotted
+from hjepa_cli.config.schema import RECORDED, Settings, dotted
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import tensors_of
 from hjepa_cli.core.networks.predictors import Predictor
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.jepa import Jepa
 from hjepa_cli.core.training.optimiser import fit_actor
 from hjepa_cli.core.training.ranks import joined
@@ -29,7 +30,7 @@ from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import measured, show_gates
 from hjepa_cli.stages import baselines
 from hjepa_cli.stages.frame_training import fit
-from hjepa_cli.stages.inputs import count_frames, embed, open_dataset
+from hjepa_cli.stages.inputs import brought_along, count_frames, embed, open_dataset, pictures
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
     SPLITS,
@@ -43,6 +44,7 @@ from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 
 REJECTED_FILE = "rejected.safetensors"  # what did not pass the gates: nothing trained is lost
 PROBE_EPOCHS = 20  # of the quick probe actor that watches training …
+LEAST_ACTION_R2 = 0.1  # of a recorded plant: below, frames hardly show what actions do
 WATCHED = 80  # … on so many training trajectories: a look must not cost more than it tells
 ARCHITECTURE = (  # the settings of an encoder that its architecture records
     *("embedding", "hidden", "frame_input", "centre", "stride_actions", "residual"),
@@ -87,6 +89,7 @@ def plan(settings: Settings, *, dataset: Path | None = None, out: Path | None = 
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
+    settings = brought_along(settings, data.settings, data.path) if data else settings
     frames = count_frames(data, settings, *SPLITS)
     loops, what = LOOPS[options.method]
     batch, steps = options.batch_trajectories * options.batch_frames, loops * options.steps
@@ -121,7 +124,7 @@ def train_and_gate(run: TrainingRun) -> dict[str, Any]:
     screen.say(f"dataset {run.dataset.path} ({settings.plant}), run {run.record.directory}")
     splits = run.render()
     architecture = describe_architecture(settings)
-    modules = untrained(architecture, settings.plant)
+    modules = untrained(architecture, settings)
     method = train_jepa if options.method == "jepa" else baselines.train
     report = method(modules, run, *splits)
     if not run.ranks.leads:
@@ -156,7 +159,8 @@ def describe_architecture(settings: Settings) -> dict[str, Any]:
         return baselines.describe_architecture(settings)
     recorded = {name: getattr(encoder, name) for name in ARCHITECTURE}
     # One level: the companion.
-    return {"kind": "encoder", **recorded, "h": encoder.h, "m": encoder.h, "l": encoder.h}
+    recorded |= {"h": encoder.h, "m": encoder.h, "l": encoder.h}
+    return {"kind": "encoder", **recorded, **pictures(settings)}
 
 
 def train_jepa(
@@ -164,7 +168,7 @@ def train_jepa(
 ) -> dict[str, Any]:
     """Train Ψ and P^H in place; return their health, of the process that leads."""
     settings, ranks, options = run.settings, run.ranks, run.settings.encoder
-    kind = plant(settings.plant)
+    kind = plant_of(settings)
     encoder, companion = modules["encoder"], modules["high"]
     assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
     encoder.fit_standardisation(standardisation_sample(train.frames))
@@ -219,10 +223,16 @@ def examine(
     ``epochs`` limits the probe actor's fit; ``None`` fits it in full, on mirrored frames too when
     training flips them.
     """
-    options, kind = settings.encoder, plant(settings.plant)
+    options, kind = settings.encoder, plant_of(settings)
     mirror = kind.force_signs if options.mirror == "exact" else None
     encoder.eval()
     train_z, test_z = (embed(encoder, split, settings, every=every) for split in (train, test))
+    of_actions = {}
+    if settings.plant == RECORDED:  # where states may be unknown, this says what embeddings know
+        actions = (split.actions[:, ::every] for split in (train, test))
+        pairs = zip((train_z, test_z), actions, strict=True)
+        ends = itertools.chain.from_iterable(pairs)
+        of_actions = {"action_r2": health.action_r2(*ends, options.h // every)}
     per_trajectory, train_z, test_z = test_z, train_z.flatten(0, 1), test_z.flatten(0, 1)
     train_states, test_states = train.states_at(every), test.states_at(every)
     fit_z, fit_labels = train_z, train.labels_at(every)
@@ -247,19 +257,25 @@ def examine(
         "std": float(test_z.std(0).mean()),
         "action_sensitivity": sensitivity,
         "actor_nrmse": error,
+        **of_actions,
     }
 
 
 def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any]]:
     """Compare the health report with the stage's gates; return value and verdict by gate."""
-    options, states = settings.encoder, plant(settings.plant).state_names
+    options, states = settings.encoder, plant_of(settings).state_names
     bounds = {}
     if options.method == "jepa":  # a baseline is there to act, and nothing else
-        least = zip(states, options.least_r2, strict=True)
+        of_recorded = settings.plant == RECORDED
+        # Of recordings nobody can say beforehand how well which state should be seen.
+        least_r2 = options.gate_r2 if of_recorded else options.least_r2
+        least = zip(states, least_r2, strict=False)
         bounds = {f"probe_r2_{name}": bound for name, bound in least} | {
             "effective_rank": options.gate_rank,
             "action_sensitivity": options.gate_sensitivity,
         }
+        if of_recorded:
+            bounds["action_r2"] = LEAST_ACTION_R2
     values = dotted(report, "_")
     bounds["actor_nrmse"] = options.gate_actor_nrmse
 
@@ -270,4 +286,5 @@ def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any
     return {
         name: {"value": values[name], "threshold": bound, "passed": passed(name, bound)}
         for name, bound in bounds.items()
+        if values[name] is not None
     }

@@ -24,7 +24,7 @@ from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_fusion
 from hjepa_cli.stages.embedding_training import begin, fit_network, save
-from hjepa_cli.stages.inputs import open_dataset
+from hjepa_cli.stages.inputs import brought_along, open_dataset, refuse_recorded
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.train_reflex import open_model
 from hjepa_cli.stages.training import (
@@ -55,7 +55,9 @@ def run(
         DataError: model and dataset belong to different plants.
         NumericalError: training diverged.
     """
+    refuse_recorded(settings, "a posterior is trained in closed loops")
     data = open_training_data(dataset, settings)
+    settings = brought_along(settings, data[0].settings, data[0].path)
     source = open_hierarchy(checkpoint, settings, screen)
     train, name = functools.partial(train_on, source), "train-fusion"
     return run_training(
@@ -72,9 +74,11 @@ def plan(
 ) -> Plan:
     """Plan the rounds of loops and of training."""
     options = settings.fusion
-    _, dataset_line = found(
+    refuse_recorded(settings, "a posterior is trained in closed loops")
+    data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
+    settings = brought_along(settings, data.settings, data.path) if data else settings
     find = functools.partial(open_hierarchy, checkpoint, settings, Screen(quiet=True))
     model, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     loops = 2 * options.rounds * options.devices * options.loop_steps

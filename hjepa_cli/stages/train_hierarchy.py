@@ -23,7 +23,7 @@ from hjepa_cli.core.control.drivers import methods_of
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import LEVELS, levels_of, load_modules
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training import levels
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, name_samples
@@ -42,7 +42,13 @@ from hjepa_cli.stages.embedding_training import (
     plan_embedding,
     save,
 )
-from hjepa_cli.stages.inputs import count_frames, embed, open_dataset
+from hjepa_cli.stages.inputs import (
+    brought_along,
+    check_same_plant,
+    count_frames,
+    embed,
+    open_dataset,
+)
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
     SPLITS,
@@ -63,6 +69,7 @@ FLAT_SETTINGS = (  # all that the training of the flat baseline depends on
     "shifted_copies",
 )
 PICTURE_SETTINGS = ("precision", "shift_px", "light_spread", "camera_noise")  # of [encoder]
+PLANT = ("plant", "recorded", "camera")  # what an encoder must have in common with a dataset
 REFLEX = ("longest_age", "forces_at_once")  # of an encoder that comes with reflexes
 
 
@@ -85,6 +92,7 @@ def run(
     strides = settings.hierarchy
     check_strides(strides.h, strides.m, strides.l)
     data = open_training_data(dataset, settings, h=strides.h)
+    settings = brought_along(settings, data[0].settings, data[0].path)
     source = open_encoder(encoder, settings, screen)
     train, name = partial(train_on, source), "train-hierarchy"
     return run_training(
@@ -103,6 +111,7 @@ def plan(
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
+    settings = brought_along(settings, data.settings, data.path) if data else settings
     find = partial(open_encoder, encoder, settings, Screen(quiet=True))
     _, encoder_line = found("encoder", find, encoder, "hjepa train-encoder")
     architecture = describe_architecture(settings)
@@ -155,7 +164,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
         health=examined,
         method=method,
         nmae_windows=nmae_windows(model, method, data, settings),
-        n_rollouts=len(data.split("clean")),
+        n_rollouts=data.splits[data.rollouts]["trajectories"],
     )
     show_hierarchy(result, screen)
     screen.say(f"model {result['checkpoint']} in {result['seconds']:.0f} s; next: hjepa eval")
@@ -173,14 +182,16 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
         DataError: trained on another plant.
     """
     if name is None:
-        wanted = settings.as_dict()["encoder"]
+        mine = settings.as_dict()
+        wanted = mine["encoder"]
 
         def fits(run: Path) -> bool:
             config = read_config(run)
             encoder = config["encoder"]
             is_jepa = encoder.get("method", "jepa") == "jepa"
             alike = all(encoder[key] == wanted[key] for key in train_encoder.ARCHITECTURE)
-            return is_jepa and alike and config["plant"] == settings.plant
+            alike &= all(config.get(key) == mine.get(key) for key in PLANT)
+            return is_jepa and alike
 
         newest = newest_run("train-encoder", fits, preset=settings.preset)
         name = newest or find_model(settings.plant)
@@ -193,12 +204,7 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
         if name.is_file():
             screen.say(f"no train-encoder run here that fits: encoder of the zoo, {name}")
     checkpoint = load_checkpoint(resolve_model(name))
-    if checkpoint.metadata["plant"] != settings.plant:
-        raise DataError(
-            f"encoder {checkpoint.path} was trained on plant {checkpoint.metadata['plant']}, "
-            f"the dataset is of plant {settings.plant}",
-            hint=f"hjepa train-encoder --plant {settings.plant}",
-        )
+    check_same_plant(checkpoint.metadata, settings, f"encoder {checkpoint.path}")
     architecture = checkpoint.metadata.get("architecture")
     if isinstance(architecture, dict) and architecture.get("kind") in ("supervised", "autoencoder"):
         raise DataError(
@@ -255,7 +261,7 @@ def examine(
     return {
         "actor_nrmse": health.nrmse(actor.act(z), test.labels),
         "action_sensitivity": health.action_sensitivity(
-            coarsest, start, end, h, plant(settings.plant).action_shape
+            coarsest, start, end, h, plant_of(settings).action_shape
         ),
     }
 

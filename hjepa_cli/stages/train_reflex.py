@@ -24,7 +24,8 @@ from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.networks.reflex import Reflex
 from hjepa_cli.core.plants.control_law import control_law
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.frames import WIDTH_PX
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.training import decay_fit, reflex_training
 from hjepa_cli.core.training.decay_fit import Law, Trial
@@ -45,7 +46,14 @@ from hjepa_cli.stages.embedding_training import (
     save,
     views_of,
 )
-from hjepa_cli.stages.inputs import count_frames, embed, open_dataset
+from hjepa_cli.stages.inputs import (
+    brought_along,
+    check_same_plant,
+    count_frames,
+    embed,
+    open_dataset,
+    refuse_recorded,
+)
 from hjepa_cli.stages.model_set import default_model
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
@@ -79,7 +87,9 @@ def run(
         DataError: model and dataset belong to different plants, or the model has no actor.
         NumericalError: training diverged.
     """
+    refuse_recorded(settings, "reflexes are trained on what the teacher does elsewhere")
     data = open_training_data(dataset, settings)
+    settings = brought_along(settings, data[0].settings, data[0].path)
     source = open_model(checkpoint, settings, screen)
     train, name = functools.partial(train_on, source), "train-reflex"
     return run_training(
@@ -99,6 +109,8 @@ def plan(
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
+    refuse_recorded(settings, "reflexes are trained on what the teacher does elsewhere")
+    settings = brought_along(settings, data.settings, data.path) if data else settings
     find = functools.partial(open_model, checkpoint, settings, Screen(quiet=True))
     _, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))
@@ -148,7 +160,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     train_networks(run, modules, z, starts, sides)
 
     law, trial, reflex = search_laws(settings, screen)
-    labels = labels_of_law(plant(settings.plant), law, starts, sides)
+    labels = labels_of_law(plant_of(settings), law, starts, sides)
     fit_actor_to(modules, "law", z, labels, architecture, settings)
     metadata = run.metadata(
         architecture, encoder=source.digest, health=source.metadata["health"], reflex=reflex
@@ -191,6 +203,7 @@ def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> C
             f"the dataset is of plant {settings.plant}",
             hint=f"hjepa train-hierarchy --plant {settings.plant}",
         )
+    check_same_plant(checkpoint.metadata, settings, f"model {path}")
     architecture = checkpoint.metadata.get("architecture")
     kind = architecture.get("kind") if isinstance(architecture, dict) else None
     if kind not in ("hierarchy", "flat", "reflex"):
@@ -253,10 +266,11 @@ def states_behind(train: RenderedSplit, settings: Settings, *, flip: bool) -> tu
 
     A mirrored picture has the forces of its unmirrored state, mirrored.
     """
-    kind, states = plant(settings.plant), train.states.numpy().astype(float)
+    kind, states = plant_of(settings), train.states.numpy().astype(float)
     starts, sides = [], []
     for mirrored, shifts_px in views_of(settings, len(states), flip=flip):
         shown_px = -shifts_px if mirrored else shifts_px
+        shown_px = shown_px * (WIDTH_PX / train.frames.shape[-2])  # in the camera's own pictures
         moved = kind.sideways(states, shown_px[:, None]) if shown_px.any() else states
         starts.append(moved.reshape(-1, states.shape[2]))
         side = np.array(kind.force_signs) if mirrored else np.ones(len(kind.force_signs))
@@ -268,7 +282,7 @@ def teacher_plans(
     network: Reflex, starts: Floats, sides: Floats, settings: Settings, explore: Generator | None
 ) -> Plans:
     """Return what the teacher does from each state on, for a network's longest age and a call."""
-    kind, steps = plant(settings.plant), network.longest_age + network.shape[0]
+    kind, steps = plant_of(settings), network.longest_age + network.shape[0]
     options, pushes_n = settings.collect, None
     if explore is not None:
         pushes_n = reflex_training.pushes(
@@ -291,7 +305,7 @@ def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[st
     options, protocol, seed = settings.reflex, settings.protocol, settings.seed
     searched = {"candidates": options.search_candidates, "rounds": options.search_rounds}
     screen.say("searching laws whose force fades, on the true state")
-    kind, devices = plant(settings.plant), options.search_devices
+    kind, devices = plant_of(settings), options.search_devices
     act = control_law(kind, settings.control)
     trial = Trial.make(kind, act, protocol, devices=devices, steps=options.search_steps, seed=seed)
     law, _ = decay_fit.search_law(trial, seed=seed, **searched)
@@ -338,6 +352,6 @@ def examine(
     """Return the held-out health of the actor of a law."""
     z = embed(modules["encoder"], test, settings).flatten(0, 1)
     states = test.states.numpy().astype(float).reshape(len(z), -1)
-    truth = labels_of_law(plant(settings.plant), law, states, np.ones((1, len(law.gains_n))))
+    truth = labels_of_law(plant_of(settings), law, states, np.ones((1, len(law.gains_n))))
     device = resolve_device(settings.device)
     return {"law_nrmse": health.nrmse(modules["law"].act(z.to(device)).cpu(), truth)}  # type: ignore[operator]

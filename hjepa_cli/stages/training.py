@@ -20,12 +20,11 @@ from hjepa_cli.compute import memory
 from hjepa_cli.compute.device import autocast, keep_freed_memory, resolve_device
 from hjepa_cli.compute.torchrun import ContactLost
 from hjepa_cli.compute.versions import versions
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.datasets.dataset import Dataset, Trajectories
 from hjepa_cli.core.networks.model import build_modules
-from hjepa_cli.core.plants.control_law import control_of
-from hjepa_cli.core.plants.frames import FRAME_BITS
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.frames import frame_bits
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.progress import Part, Progress
 from hjepa_cli.core.training.ranks import ALONE, Ranks
@@ -33,7 +32,7 @@ from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import results
-from hjepa_cli.stages.inputs import count_frames, open_dataset, render
+from hjepa_cli.stages.inputs import brought_along, count_frames, open_dataset, render
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint
 from hjepa_cli.storage.files import canonical_json
@@ -134,20 +133,24 @@ def open_training_data(path: Path | None, settings: Settings, *, h: int = 0) -> 
     resolve_device(settings.device)  # refused before anything is read
     dataset = open_dataset(path, settings)
     frames = count_frames(dataset, settings, *SPLITS)
-    memory.check(rendered_bytes(frames), f"training on {frames} frames")
+    need_bytes = rendered_bytes(frames, dataset.frame_shape)
+    memory.check(need_bytes, f"training on {frames} frames")
     recorded = {split: dataset.split(split) for split in SPLITS}
     check_stride(h, recorded["train"].steps)
     for name, split in recorded.items():
-        if (split.states == split.states[0, 0]).all():
+        if split.states.size and (split.states == split.states[0, 0]).all():
             raise _still(dataset, name, "states")
     return dataset, recorded
 
 
 def _still(dataset: Dataset, split: str, what: str) -> DataError:
     """Return the error of data without variance, of which nothing can be learned."""
+    other = "hjepa collect with other starts or exploration in [collect] of --config FILE.toml"
+    if dataset.plant == RECORDED:
+        other = "hjepa data import with recordings in which something moves"
     return DataError(
         f"dataset {dataset.path}: all {what} of split '{split}' are equal: nothing moves in it",
-        hint="hjepa collect with other starts or exploration in [collect] of --config FILE.toml",
+        hint=other,
     )
 
 
@@ -173,9 +176,7 @@ def run_training(
     """
     keep_freed_memory()
     dataset, recorded = data
-    # A dataset brings the law that its labels are of.
-    control = control_of(dataset.settings, dataset.path)
-    settings = dataclasses.replace(settings, control=control)
+    settings = brought_along(settings, dataset.settings, dataset.path)
     inputs = {"dataset": describe_input(dataset.path, dataset.digest)}
     inputs |= {name: describe_input(one.path, one.digest) for name, one in sources.items()}
     with ExitStack() as stack:
@@ -219,7 +220,7 @@ def plan_training(
 ) -> Plan:
     """Plan a training stage that leaves a run with a checkpoint of an architecture."""
     with torch.device("meta"):
-        tensors = untrained(architecture, settings.plant).state_dict().values()
+        tensors = untrained(architecture, settings).state_dict().values()
     return Plan(
         command=stage,
         reads=[*reads],
@@ -227,13 +228,13 @@ def plan_training(
         writes=[f"run {run_directory(stage, out)}"],
         writes_bytes=sum(tensor.nbytes for tensor in tensors),
         seconds=5 + seconds_of(amounts),
-        memory_bytes=rendered_bytes(amounts.get("rendered frames", 0)),
+        memory_bytes=rendered_bytes(amounts.get("rendered frames", 0), settings.camera.frame_shape),
     )
 
 
-def rendered_bytes(frames: float) -> float:
+def rendered_bytes(frames: float, frame_shape: tuple[int, int, int]) -> float:
     """Return what a training's frames take while they are rendered: as parts, and as a whole."""
-    return 2 * frames * FRAME_BITS / 8
+    return 2 * frames * frame_bits(frame_shape) / 8
 
 
 def check_stride(h: int, steps: int) -> None:
@@ -245,7 +246,7 @@ def check_stride(h: int, steps: int) -> None:
         )
 
 
-def untrained(architecture: Architecture, plant_name: str) -> nn.ModuleDict:
-    """Return new networks of an architecture for a plant, drawn from torch's generator."""
-    kind = plant(plant_name)
+def untrained(architecture: Architecture, settings: Settings) -> nn.ModuleDict:
+    """Return new networks of an architecture for the settings' plant, drawn by torch."""
+    kind = plant_of(settings)
     return build_modules(architecture, kind.action_shape, kind.force_signs)

@@ -16,11 +16,13 @@ from hjepa_cli.core.plants.control_law import check_stable
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.law_search import GAPS, LawSearch
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.inputs import refuse_recorded
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
 
 LAW = "law.toml"
+WHY = "laws are searched in simulated loops"
 
 
 def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[str, Any]:
@@ -29,6 +31,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     Raises:
         NumericalError: the search found no law that holds the plant.
     """
+    refuse_recorded(settings, WHY)
     kind = plant(settings.plant)
     with Run.create("tune-law", out, settings.as_dict()) as record:
         if record.result is not None:
@@ -66,6 +69,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
 
 def plan(settings: Settings, *, out: Path | None = None) -> Plan:
     """Plan both searches."""
+    refuse_recorded(settings, WHY)
     options, protocol = settings.tune, settings.protocol
     loops = 2 * options.candidates * options.rounds * options.devices * len(GAPS)
     return Plan(

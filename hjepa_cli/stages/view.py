@@ -39,7 +39,7 @@ from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.radio.channel import rayleigh_power_gains
-from hjepa_cli.core.radio.laws.equal import equal_devices
+from hjepa_cli.core.radio.phy.equal_parts import equal_devices
 from hjepa_cli.errors import MissingInputError, UsageError, choices, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.screen import Screen
@@ -136,7 +136,7 @@ def run(
     films = [film(name, settings, models.model, link, probe, screen) for name in settings.methods]
     every = every or max(settings.protocol.total_steps // 100, 1)
     kind = actual_plant(settings.plant, settings.conditions)
-    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    camera = actual_camera(settings)
     pictures = animation.Pictures(films, link, kind, camera, every)
     result = {
         "checkpoint": models.path,

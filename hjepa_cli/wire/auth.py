@@ -49,7 +49,7 @@ def read_key(path: Path) -> bytes:
     if mode & 0o077:
         raise DataError(
             f"key file {path} has mode {mode:04o}: others may read or change it",
-            hint=f"{shell(['chmod', 600, path])}; if others have had time to read it, make a new one",
+            hint=f"{shell(['chmod', 600, path])}; and make a new one if others may have read it",
         )
     if len(data) < KEY_BYTES[0]:
         raise DataError(

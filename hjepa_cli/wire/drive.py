@@ -75,7 +75,8 @@ class Drive:
             if time.monotonic() >= until_s and not self._device.connected:
                 raise Unavailable(
                     f"no answer from {written(self._server)} within {wait_s:g} s",
-                    hint="does a server run there, with the same --key? start one: hjepa serve --model DIR",
+                    hint="does a server run there, with the same --key? start one: "
+                    "hjepa serve --model DIR",
                 )
 
     def run(self, steps: int | None, stop_after_s: float | None) -> None:

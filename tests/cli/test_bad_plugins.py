@@ -21,6 +21,7 @@ LAW = block("plugins.md", "ClosedFormLaw(")
 SCHEDULER = block("plugins.md", "Scheduler(")
 CODEC = block("plugins.md", "Codec(")
 METHOD = block("plugins.md", "least-squares")
+PHY = block("plugins.md", "register(Phy(")
 PLANT = block("own_plant.md", "class Pendulum")
 QUICK = """
 [protocol]
@@ -120,10 +121,10 @@ def test_names_that_are_taken_are_those_of_the_program():
     "name", ["", "a,b", "a b", "x\n", "a/b", "hold+3", ".x", "a" * 65, "paper"]
 )
 @pytest.mark.parametrize(
-    "text", [LAW, SCHEDULER, CODEC, METHOD, PLANT], ids=lambda text: text[3:20]
+    "text", [LAW, SCHEDULER, CODEC, METHOD, PHY, PLANT], ids=lambda text: text[3:20]
 )
 def test_names_that_no_list_flag_or_path_can_carry_are_refused(shell, text, name):
-    own = re.search(r'"(half-duty|patient|signs|least-squares|pendulum)"', text)[0]
+    own = re.search(r'"(half-duty|patient|signs|least-squares|two-thirds|pendulum)"', text)[0]
     if name != "paper":
         refused(shell, text.replace(own, repr(name)), f"cannot be called {name!r}")
     elif text is PLANT:
@@ -144,6 +145,7 @@ def test_names_that_no_list_flag_or_path_can_carry_are_refused(shell, text, name
         (METHOD, '"embedding", build', '"embeding", build', "did you mean 'embedding'?"),
         (METHOD, "offered=of_hierarchy", "offered=None", "offered = None is no function"),
         (METHOD, "fitted=True", "fitted='yes'", "fitted = 'yes' is no bool"),
+        (PHY, "layer=layer", "layer=3", "layer = 3 is no function"),
         (SCHEDULER, "np.where(view.able, view.waited, 0.0))", "0, 'yes')", "= 'yes' is no bool"),
         (PLANT, "step_s: float = 5e-3", "step_s: float = 0.0", "step_s = 0.0; expected more"),
         (PLANT, '("rad", "rad/s")', '("rad",)', "state_names is for 2 values, state_units for 1"),

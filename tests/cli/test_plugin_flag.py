@@ -55,7 +55,7 @@ def test_a_plugin_is_loaded_before_anything_is_checked() -> None:
         assert planned.returncode == 0 and "of plant twin" in planned.stdout, planned.stderr
     shown = hjepa("config show plant --config c.toml --plugin twin.py --json")
     assert json.loads(shown.stdout)["values"]["plant"] == {"value": "twin", "from": "c.toml"}
-    assert "desktop|gym|quadrotor|twin" in hjepa("collect --plugin twin.py --help").stdout
+    assert "desktop|gym|quadrotor|recorded|twin" in hjepa("collect --plugin twin.py --help").stdout
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hjepa_cli.core.control.codecs.integers import Integers
-from hjepa_cli.core.plants.frames import FRAME_BITS
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, frame_bits
 from hjepa_cli.errors import UsageError
 
 
@@ -107,5 +107,5 @@ def test_impossible_bits_are_refused(bits: int) -> None:
 def test_bit_counts() -> None:
     assert Integers(256, 8).bits == 2064  # 256 values and one 16-bit scale
     assert Integers(16, 6).bits == 112
-    assert 2 * FRAME_BITS == 393_216
-    assert 1 - 256 * 8 / FRAME_BITS == pytest.approx(0.98958, abs=1e-5)  # paper
+    assert 2 * frame_bits(FRAME_SHAPE) == 393_216
+    assert 1 - 256 * 8 / frame_bits(FRAME_SHAPE) == pytest.approx(0.98958, abs=1e-5)  # paper

@@ -28,7 +28,8 @@ from hjepa_cli.core.evaluation.load_search import (
     find_load,
 )
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.core.radio.uplink import Access, Uplink, report_bits
+from hjepa_cli.core.radio.phy.shannon import report_bits
+from hjepa_cli.core.radio.uplink import Access, Uplink
 from hjepa_cli.errors import UsageError
 
 DESKTOP = plant("desktop")

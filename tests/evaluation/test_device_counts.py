@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from hjepa_cli.core.evaluation.device_ratios import gain, ratio_interval, ratio_of
-from hjepa_cli.core.radio.capacity import Cell
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.plugins import LAWS
 

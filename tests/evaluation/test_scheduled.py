@@ -18,7 +18,7 @@ from hjepa_cli.core.evaluation import load_simulator
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.coding import packet_uses
 from hjepa_cli.core.radio.factory_hall import drop_devices
-from hjepa_cli.core.radio.uplink import report_bits
+from hjepa_cli.core.radio.phy.shannon import report_bits
 from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import block_loads, report, scale
@@ -304,3 +304,27 @@ def test_bad_settings(change):
 
     with pytest.raises(UsageError):
         check_settings(load_settings(flags=change))
+
+
+def test_grants_and_reports_of_an_nr_cell(stage):
+    """Turns are configured; who decides slot by slot signals 16 grants a slot of the carrier."""
+    pytest.importorskip("sionna")
+    result = stage("hold-true", schedulers=["round-robin", "innovation"], phy="nr", snr_db="20")
+    turns, asked = result["rows"]
+    assert (turns["grants"], asked["grants"]) == ("configured", "dynamic")
+    assert turns["devices"] == math.floor(turns["load_per_block"] * 34)  # 2 slots, 17 of 3 PRBs
+    # Scheduling requests are reserved for everybody, and 32 grants are what 34 blocks leave.
+    reserved = asked["devices"] / 8 / 6 * 2 / (2 * 14 * 51)
+    assert asked["reports_share"] == pytest.approx(reserved, rel=1e-6)
+    room = min(32, 34 * (1 - reserved))
+    assert asked["devices"] == pytest.approx(asked["load_per_block"] * room, rel=0.01)
+    assert "configured" in stage.out.getvalue() and "dynamic" in stage.out.getvalue()
+
+
+@pytest.mark.parametrize("fading", ["jakes", "tdl-a"])
+def test_moving_devices(stage, fading):
+    if fading != "jakes":
+        pytest.importorskip("sionna")
+    result = stage("hold-true", schedulers=["max-aoi"], fading=fading, speed_m_s=10.0, snr_db="20")
+    assert result["rows"][0]["devices"] > 0
+    assert f"{fading} at 10 m/s" in stage.out.getvalue()

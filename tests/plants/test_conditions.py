@@ -37,7 +37,7 @@ def devices(options: Settings) -> System:
 
 
 def camera(options: Settings) -> Camera:
-    return actual_camera(options.plant, options.conditions, options.seed)
+    return actual_camera(options)
 
 
 def test_nominal_conditions_change_nothing() -> None:

@@ -11,6 +11,7 @@ import scipy.integrate
 import scipy.signal
 from command_line import ENVIRONMENT, ROOT, open_shell
 
+from hjepa_cli.config.schema import RECORDED
 from hjepa_cli.config.settings import PRESETS, load_settings
 from hjepa_cli.core.control.loop import Draws, every_step, simulate
 from hjepa_cli.core.control.methods.true_state import true_state_driver
@@ -23,7 +24,7 @@ from hjepa_cli.errors import UsageError
 from hjepa_cli.plugins import PLANTS
 from hjepa_cli.storage.runs import to_toml
 
-NAMES = list(PLANTS)
+NAMES = [name for name in PLANTS if name != RECORDED]  # which has no equations
 QUADROTOR = plant("quadrotor")
 
 TINY = """

@@ -18,7 +18,8 @@ from hjepa_cli.storage.zoo import list_models
 PAGES = ("README.md", "CONTRIBUTING.md", *sorted(f"docs/{p.name}" for p in ROOT.glob("docs/*.md")))
 NOT_RUN = re.compile(r"<!-- not run: [^>]+ -->\s*```\w*\n.*?```", re.DOTALL)
 WITH_PLAN = (
-    *("collect", "train-encoder", "train-hierarchy", "eval", "scale", "view", "reproduce"),
+    *("collect", "train-encoder", "train-hierarchy", "eval", "scale", "survive", "view"),
+    "reproduce",
     *("export", "serve", "device", "link", "bench-link"),
 )
 PLACEHOLDER = re.compile(r"[A-Z]{3,}|…|\.\.\.|[<>\[\]|]|\{")

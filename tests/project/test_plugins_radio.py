@@ -18,6 +18,7 @@ from hjepa_cli.stages import scale
 
 SCHEDULER = block("plugins.md", "Scheduler(")
 LAW = block("plugins.md", "ClosedFormLaw(")
+PHY = block("plugins.md", "register(Phy(")
 TINY = {
     "protocol": "paper",
     "protocol.steps": 120,
@@ -33,7 +34,7 @@ TINY = {
 def load(tmp_path, monkeypatch):
     """Load plugins from text, in an empty directory and for one test."""
     monkeypatch.chdir(tmp_path)
-    for registry in (plugins.SCHEDULERS, plugins.LAWS):
+    for registry in (plugins.SCHEDULERS, plugins.LAWS, plugins.PHYS):
         monkeypatch.setattr(registry, "_added", {})
     monkeypatch.setattr(plugins, "_sources", [])
 
@@ -81,6 +82,20 @@ def test_a_law_from_a_file(load):
         assert [int(row["devices"]) for row in csv.DictReader(file)] == [
             row["devices"] for row in half["rows"]
         ]
+
+
+def test_a_physical_layer_from_a_file(load):
+    load(PHY)
+    out = io.StringIO()
+    less = counted(Screen(True, stdout=out), phy="two-thirds", snr_db="10,20")
+    for ours, theirs in zip(less["rows"], counted(snr_db="10,20")["rows"], strict=True):
+        assert abs(ours["devices"] - 2 / 3 * theirs["devices"]) < 1
+        assert ours["tolerance"] == theirs["tolerance"]
+    assert less["phy"] == "two-thirds" and "capacity of two thirds" in out.getvalue()
+    scheduled = counted(phy="two-thirds", law="scheduled", schedulers=("round-robin",))["rows"]
+    assert all(row["devices"] > 0 for row in scheduled)
+    with pytest.raises(UsageError, match="physical layer shannon, this is two-thirds"):
+        counted(phy="two-thirds", law="scheduled", overhead_bits=24)
 
 
 def test_a_law_from_a_file_has_the_flags_of_its_kind(load):

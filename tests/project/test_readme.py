@@ -61,6 +61,12 @@ def test_the_main_table_is_what_its_command_prints(shell):
         assert agree(row["gap D* [ms]"], found["tolerance"], *found["tolerance_ci95"]), method
         if method in ("hjepa", "hold", "oracle"):
             assert f"{found['devices']:,}" in FIRST_SCREEN
+    if importlib.util.find_spec("sionna"):
+        document_nr = shell("scale", "--phy", "nr", "--snr", "20", "--json").document
+        for found in document_nr["rows"]:
+            if found["method"] in table:
+                cell = table[found["method"]]["at 20 dB, 5G NR"]
+                assert numbers(cell) == [found["devices"], *found["devices_ci95"]], found
     gains = {gain["over"]: gain for gain in document["gains"] if gain["method"] == "hjepa"}
     low, high = gains["ts-jepa-1"]["ratio_ci95"]
     more = f"{100 * (gains['ts-jepa-1']['ratio'] - 1):.1f} % ({100 * (low - 1):.1f} to"

@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hjepa_cli.config.schema import RadioSettings
 from hjepa_cli.core.radio import capacity
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import outage_probability
-from hjepa_cli.core.radio.laws import duty, equal
+from hjepa_cli.core.radio.laws import duty
 from hjepa_cli.core.radio.laws.scheduled import ScheduledBand
+from hjepa_cli.core.radio.phy import equal_parts as equal
 from hjepa_cli.errors import UsageError
 
 getcontext().prec = 50
@@ -33,9 +34,10 @@ def test_a_packet_that_fills_its_slot_exactly_is_on_time():
     k = np.arange(1, 31)
     c = capacity.slot_capacity(1000.0 * k, 1e6, 1e-3, 10 * np.log10(2.0**k - 1))
     assert np.any(c < 1) and np.all(capacity.late_slots(c) == 0)
-    band = ScheduledBand(capacity.Cell(1e6, 1e-3, 0.0), RadioSettings(), 0.62)
+    band = ScheduledBand(Cell(1e6, 1e-3, 0.0), 0.62)
     for bits, snr_db in zip(1000 * k, 10 * np.log10(2.0**k - 1), strict=True):
-        assert band.fits(int(bits), snr_db) and not band.fits(int(bits) + 1, snr_db)
+        assert band.fits("max-aoi", int(bits), snr_db)
+        assert not band.fits("max-aoi", int(bits) + 1, snr_db)
 
 
 @pytest.mark.parametrize(

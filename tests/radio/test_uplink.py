@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from hjepa_cli import plugins
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable
 from hjepa_cli.core.evaluation.cell_simulation import Outbox
 from hjepa_cli.core.radio import uplink as module
 from hjepa_cli.core.radio.fading import block_fading
+from hjepa_cli.core.radio.phy.phy import Reports
 from hjepa_cli.core.radio.schedulers.scheduler import Scheduler, pick
 from hjepa_cli.core.radio.uplink import Access, Uplink
 
@@ -111,3 +113,41 @@ def test_a_flood_of_reports_does_not_deafen_the_base_station():
         uplink._reported[:] = 0.0  # as if all had been served: they will report again
     assert uplink._delta == pytest.approx(0.01)
     assert looks == 40 * 3 - 5  # every eighth slot each, but for the first slot
+
+
+def test_reports_in_levels_that_take_a_while():
+    """From δ = 0.02 on, each level twice the one below; the base station hears two slots later."""
+    growth = ErrorGrowthTable(np.full(50, 1.0))
+    told = Reports(2, levels=4, delay_slots=2)
+    known = []
+
+    def score(view):
+        known.append(view.reported.copy())
+        return np.zeros(3)
+
+    plugins.SCHEDULERS._added["listener"] = Scheduler("listener", score, wants_reports=True), None
+    try:
+        access = Access("listener", 1, 300.0, -math.inf, 1.0, (0.0,), growth, 0, reports=told)
+        uplink = Uplink(access, 3)
+        for slot in range(5):
+            uplink.begin()
+            if slot == 1:
+                delta = uplink._delta
+                uplink.hear(np.ones(3, dtype=bool), delta * np.array([0.9, 1.5, 40.0]))
+            uplink.grant()
+    finally:
+        del plugins.SCHEDULERS._added["listener"]
+    steps = [0.0, delta * 2**0.5, delta * 2**3.5]
+    assert np.allclose(known[:3], 0.0) and np.allclose(known[3:], steps)
+
+
+def test_a_copy_waits_for_its_round_trip():
+    """After a lost first copy the device is not served before three slots have gone by."""
+    growth = ErrorGrowthTable(np.full(50, 1.0))
+    access = Access("max-aoi", 2, 300.0, -math.inf, 1.0, (1.0, 0.0), growth, 0, round_trip_slots=3)
+    uplink, arrivals = Uplink(access, 2), []
+    for _ in range(9):
+        uplink.begin()
+        arrivals.append(uplink.grant().all())
+    # Everybody in slot 0; first copies in 1, second ones in 4; first in 5, second in 8.
+    assert np.flatnonzero(arrivals).tolist() == [0, 4, 8]

@@ -78,7 +78,8 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
     driver: Driver = METHODS[name].build(settings, model)
     if not driver.uses_link:
         return dataclasses.replace(driver, name=late(name, steps))
-    told = confirmation_bits(settings.protocol, len(plant(settings.plant).force_signs))
+    kind = model.plant if model else plant(settings.plant)
+    told = confirmation_bits(settings.protocol, len(kind.force_signs))
     bits = driver.bits_per_transmission + told
     driver = dataclasses.replace(
         driver, name=late(name, steps), delay_steps=steps, bits_per_transmission=bits
@@ -102,7 +103,7 @@ def embedding_driver(
     has no other controller for links that deliver at every step.
     """
     coder, hold = coder_of(settings, model), last_force(model)
-    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    camera = actual_camera(settings)
     sensor = embedding_sensor(model, coder.send, camera)
     drives = controller or hold
     reactive = hold if family == "embedding" else drives

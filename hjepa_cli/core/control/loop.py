@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
-from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels
 from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
@@ -166,7 +166,7 @@ class LinkDraws:
             np.stack(lost, axis=1) < protocol.downlink_loss if lost else None,
         )
 
-    def part(self, devices: slice) -> "LinkDraws":
+    def part(self, devices: slice | Integers) -> "LinkDraws":
         """Take the draws of some of the devices."""
         extra, lost = (None if of is None else of[:, devices] for of in self._drawn)
         return LinkDraws(self.delay_steps, extra, lost)
@@ -451,6 +451,9 @@ class ScoredPlants:
         return forces_n
 
 
-def last_states(rollouts: Floats, k: int) -> Floats:
-    """Return what a sensor gets in step k of rollouts [R, steps + 1, S], stored from k = −1 on."""
+def last_states(rollouts: Floats | Pixels, k: int) -> Any:
+    """Return what a sensor gets in step k of rollouts [R, steps + 1, S], stored from k = −1 on.
+
+    Of recordings that is frames, [R, steps + 1, H, W, C].
+    """
     return rollouts[:, frames_seen(k, LONGEST)]

@@ -1,22 +1,25 @@
 """Sensors of devices see their state, what their camera sees, or embeddings of that."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.plants.frames import frames_of
-from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import Camera
 
 if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
 
 SENSOR_BATCH = 256  # inputs of two frames rendered and encoded at a time: 12 MiB
+
+
+def is_pixels(seen: Floats | Pixels) -> TypeGuard[Pixels]:
+    """Tell whether recorded frames came in place of states."""
+    return seen.dtype == np.uint8
 
 
 def true_state(seen: Floats) -> Floats:
@@ -26,26 +29,31 @@ def true_state(seen: Floats) -> Floats:
 
 def camera_sensor(
     model: "Model", camera: Camera | None = None
-) -> Callable[[Floats], NDArray[np.uint8]]:
-    """Return a function from the last states [m, 4, S] to frames uint8 [m, κ, 64, 128, 3].
+) -> Callable[[Floats | Pixels], Pixels]:
+    """Return a function from the last states [m, 4, S] to frames uint8 [m, κ, H, W, C].
 
     κ are as many as the model's network sees, taken by the camera that the model was trained with
-    if none is given.
+    if none is given. What was recorded comes as frames uint8 [m, 4, H, W, C] in place of states.
     """
-    camera = camera or plant(model.plant_name).camera()
-    return lambda seen: frames_of(camera, seen[:, -model.frames :], SENSOR_BATCH)
+    camera = camera or model.camera
+
+    def look(seen: Floats | Pixels) -> Pixels:
+        last = seen[:, -model.frames :]
+        return last if is_pixels(last) else frames_of(camera, last, SENSOR_BATCH)
+
+    return look
 
 
 def embedding_sensor(
     model: "Model", send: Callable[[Tensor], Tensor] | None = None, camera: Camera | None = None
-) -> Callable[[Floats], Tensor]:
-    """Return a function from the last states [m, 4, S] to received embeddings [m, D].
+) -> Callable[[Floats | Pixels], Tensor]:
+    """Return a function from the last states [m, 4, S], or frames, to received embeddings [m, D].
 
     They are as ``send`` makes them arrive, [n, D] → [n, D]; without it those that the device has.
     """
     look = camera_sensor(model, camera)
 
-    def sense(seen: Floats) -> Tensor:
+    def sense(seen: Floats | Pixels) -> Tensor:
         received = []
         for start in range(0, len(seen), SENSOR_BATCH):
             z = model.encode(look(seen[start : start + SENSOR_BATCH]))

@@ -11,13 +11,19 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
-from hjepa_cli.core.plants.frames import FRAME_SHAPE
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.config.schema import RECORDED, CameraSettings
+from hjepa_cli.core.datasets.importing import arrays as arrays_of
+from hjepa_cli.core.datasets.importing.assembly import Assembly
+from hjepa_cli.core.datasets.importing.prepared import Options, Prepared, prepare
+from hjepa_cli.core.plants.named import camera_in, plant_in
+from hjepa_cli.core.plants.recorded import RecordedCamera
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, HjepaError, MissingInputError, NumericalError, UsageError
 from hjepa_cli.storage import files, seals
 from hjepa_cli.storage import tensors as arrays
@@ -37,10 +43,10 @@ class Trajectories:
 
     Args:
         states: float32 [N, T + 1, S], the plant's states; of a cart-pole x (m), x_dot (m/s), theta
-            (rad), theta_dot (rad/s).
+            (rad), theta_dot (rad/s). S = 0 where none were recorded.
         applied_n: float32 [N, T, *A], the force or forces applied at step k (N).
         teacher_n: float32 [N, T, *A], the teacher's for the state at step k (N).
-        frames: uint8 [N, T + 1, 64, 128, 3], or ``None`` if they are rendered on load.
+        frames: uint8 [N, T + 1, H, W, C], or ``None`` if they are rendered on load.
     """
 
     states: np.ndarray
@@ -82,6 +88,7 @@ class _SplitEntry(msgspec.Struct):
 
 class _Config(msgspec.Struct):
     collect: dict[str, Any] = {}
+    camera: CameraSettings = CameraSettings()
 
 
 class _Manifest(msgspec.Struct):
@@ -107,6 +114,83 @@ class Dataset:
     digest: str
     frames: str
     splits: dict[str, Any]
+
+    @classmethod
+    def from_arrays(
+        cls,
+        frames: Sequence[np.ndarray] | np.ndarray,
+        actions: Sequence[np.ndarray] | np.ndarray,
+        states: Sequence[np.ndarray] | np.ndarray | None = None,
+        *,
+        expert_actions: Sequence[np.ndarray] | np.ndarray | None = None,
+        limits: Sequence[float] | None = None,
+        fps: float = 50.0,
+        size: tuple[int, int] = (64, 128),
+        grey: bool = False,
+        mirror_signs: Sequence[float] = (),
+        steps: int | None = None,
+        action_offset: int = 0,
+        held_out: float = 0.2,
+        out: str | Path | None = None,
+    ) -> "Dataset":
+        """Write a dataset of recorded arrays; see ``hjepa data import`` for what the rest means.
+
+        Args:
+            frames: [N, R, H, W, C], or a list with [R, H, W, C] of each episode, R its own.
+            actions: [N, R, A] or [N, R − 1, A], or a list; row j leads from frame j to frame j + 1.
+            states: [N, R, S], or a list, if anybody knows them.
+            expert_actions: what an expert would do at each frame; default: the actions.
+            limits: of the actions; default: the largest of each.
+            fps: frames a second.
+            size, grey: of the frames in the dataset.
+            mirror_signs: what a mirror does to each action, 1 or −1, where that is true at all.
+            steps: of a trajectory; default: of the shortest episode.
+            action_offset: row j + ``action_offset`` leads from frame j to frame j + 1.
+            held_out: share of the episodes for the split ``test``.
+            out: its directory; default: the next free ``data/recorded-<nnnn>``.
+
+        Raises:
+            UsageError: an argument that makes no sense, or ``out`` holds a dataset already.
+            DataError: an episode is unsound; the message says which row.
+        """
+        given = {"actions": actions, "states": states, "expert": expert_actions}
+        columns = {key: list(values) for key, values in given.items() if values is not None}
+        recording = arrays_of.recording(list(frames), columns, format="arrays")
+        if limits is None:
+            rows = np.concatenate([np.abs(rows).reshape(len(rows), -1) for rows in actions])
+            limits = np.where(rows.max(axis=0) > 0, rows.max(axis=0), 1.0).tolist()
+        camera = CameraSettings(*size, grey)
+        options = Options(
+            camera,
+            limits=tuple(limits),
+            step_s=1 / fps,
+            offset=action_offset,
+            steps=steps,
+            held_out=held_out,
+            mirror=tuple(mirror_signs),
+        )
+        prepared = prepare({"train": recording}, options)
+        with open_directory(None if out is None else Path(out), RECORDED) as directory:
+            if (directory / MANIFEST).exists():
+                raise UsageError(f"{directory} holds a dataset already; choose another out")
+            definition = definition_of(prepared, camera)
+            made = write_shards(directory, prepared.assembly, definition)
+            return write_recording(directory, list(made), definition)
+
+    @property
+    def kind(self) -> System:
+        """Return the plant. Raises DataError where no plugin in force adds it."""
+        return _plant(self.plant, self.settings, self.path)
+
+    @property
+    def frame_shape(self) -> tuple[int, int, int]:
+        """Return (H, W, C) of its pictures."""
+        return camera_in(self.settings).frame_shape
+
+    @property
+    def rollouts(self) -> str:
+        """Name the split on which predicted forces are compared with the right ones."""
+        return "clean" if "clean" in self.splits else "test"
 
     def split(self, name: str) -> Trajectories:
         """Read one of ``train``, ``test``, ``clean``, verifying sha256, shapes and values.
@@ -136,7 +220,8 @@ class Dataset:
     def _read_shard(self, shard: Mapping[str, Any], steps: int) -> dict[str, np.ndarray]:
         path = self.path / shard["name"]
         stored = self.frames == "stored"
-        expected = _expected(shard["trajectories"], steps, stored, path, self.plant)
+        count, kind, frame_shape = shard["trajectories"], self.kind, self.frame_shape
+        expected = _expected(count, steps, stored, path, kind, frame_shape)
         values = (np.dtype(name).itemsize * math.prod(shape) for name, shape in expected.values())
         limit_bytes = sum(values) + arrays.HEADER_LIMIT_BYTES + 8
         data = files.read_bytes(path, limit=limit_bytes)
@@ -154,9 +239,15 @@ class Dataset:
 
 
 def write_shard(
-    directory: Path, shard: Shard, trajectories: Trajectories, plant_name: str
+    directory: Path,
+    shard: Shard,
+    trajectories: Trajectories,
+    plant_name: str,
+    settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Described:
     """Write one shard and return how the manifest will describe it.
+
+    ``settings`` are those that the manifest will have.
 
     Raises:
         DataError: wrong shapes or dtypes.
@@ -165,7 +256,8 @@ def write_shard(
     """
     stored, tensors = trajectories.frames is not None, trajectories.tensors()
     path = directory / shard.name
-    expected = _expected(len(trajectories), trajectories.steps, stored, path, plant_name)
+    kind, frame_shape = _plant(plant_name, settings, path), camera_in(settings).frame_shape
+    expected = _expected(len(trajectories), trajectories.steps, stored, path, kind, frame_shape)
     if reason := arrays.difference(tensors, expected):
         raise DataError(f"{path}: {reason}")
     if bad := arrays.non_finite(tensors):
@@ -185,6 +277,59 @@ def write_shard(
         "stored": stored,
         "sha256": hashlib.sha256(data).hexdigest(),
     }
+
+
+def definition_of(prepared: Prepared, camera: CameraSettings) -> dict[str, Any]:
+    """Return the settings of an imported dataset: its plant, its pictures, how it was cut."""
+    return {
+        "seed": None,
+        "recorded": dataclasses.asdict(prepared.known),
+        "camera": dataclasses.asdict(camera),
+        "import": {
+            "format": prepared.format,
+            "episodes": prepared.episodes,
+            "lossy": prepared.lossy,
+        },
+    }
+
+
+def write_shards(
+    directory: Path,
+    made: Assembly,
+    settings: Mapping[str, Any],
+    done: Mapping[str, Described] = MappingProxyType({}),
+) -> Iterator[Described]:
+    """Write the shards of an assembly that are not ``done``; yield what describes each.
+
+    One without any sound trajectory has none, and no file.
+
+    Raises:
+        As :func:`write_shard` and :meth:`Assembly.trajectories`.
+    """
+    left = [shard for shard in made.shards() if shard.name not in done]
+    for shard, tensors in made.trajectories(left):
+        found = {"name": shard.name, "split": shard.split, "trajectories": 0}
+        if tensors:
+            found = write_shard(directory, shard, Trajectories(**tensors), RECORDED, settings)
+        yield found
+
+
+def write_recording(
+    directory: Path, shards: Sequence[Described], settings: Mapping[str, Any]
+) -> Dataset:
+    """Write the manifest of an imported dataset. Raises DataError where a split is empty."""
+    written = [shard for shard in shards if shard["trajectories"]]
+    for split in dict.fromkeys(shard["split"] for shard in shards):
+        if split not in {shard["split"] for shard in written}:
+            raise DataError(f"no trajectory of split {split} is left")
+    size = camera_in(settings)
+    return write_manifest(
+        directory,
+        settings=settings,
+        shards=written,
+        plant_name=RECORDED,
+        camera_manifest=RecordedCamera(size.frame_shape).manifest(),
+    )
 
 
 def write_manifest(
@@ -247,7 +392,10 @@ def load_dataset(path: Path, plant_name: str | None = None) -> Dataset:
             hint=f"hjepa collect with a preset of plant {plant_name}",
         )
     fields = ("plant", "config", "camera", "sha256", "frames", "splits")
-    return Dataset(path, *(manifest[name] for name in fields))
+    data = Dataset(path, *(manifest[name] for name in fields))
+    if data.plant == RECORDED:
+        _ = data.kind  # described soundly
+    return data
 
 
 @contextlib.contextmanager
@@ -292,12 +440,22 @@ def per_shard(stored: bool) -> int:
     return SHARD_TRAJECTORIES_WITH_FRAMES if stored else SHARD_TRAJECTORIES
 
 
-def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str) -> arrays.Shapes:
-    """Return the tensors of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
+def _plant(name: str, settings: Mapping[str, Any], where: Path) -> System:
     try:
-        kind = plant(plant_name)
+        return plant_in(name, settings)
     except UsageError as error:
         raise DataError(f"{where}: {error.message}") from None
+
+
+def _expected(
+    count: int,
+    steps: int,
+    stored: bool,
+    where: Path,
+    kind: System,
+    frame_shape: tuple[int, int, int],
+) -> arrays.Shapes:
+    """Return the tensors of :class:`Trajectories` for ``count`` trajectories of ``steps``."""
     if count < 1 or steps < 1:
         raise DataError(f"{where} holds {count} trajectories of {steps} steps; at least 1 of each")
     forces = (count, steps, *kind.action_shape)
@@ -307,5 +465,5 @@ def _expected(count: int, steps: int, stored: bool, where: Path, plant_name: str
         "teacher_n": ("float32", forces),
     }
     if stored:
-        expected["frames"] = ("uint8", (count, steps + 1, *FRAME_SHAPE))
+        expected["frames"] = ("uint8", (count, steps + 1, *frame_shape))
     return expected

@@ -4,8 +4,9 @@ One row per frame, trajectory after trajectory. A trajectory of T steps gives T 
 is the frame before k = 0, which moves on without force. So no frame is lost, and row j of a
 trajectory holds what was seen and the action that led from there to row j + 1:
 
-- ``pixels`` uint8 [rows, 64, 128, 3], the camera's RGB frames;
+- ``pixels`` uint8 [rows, H, W, C], the camera's frames, 64 × 128 RGB ones unless set otherwise;
 - ``state`` float32 [rows, S], of a cart-pole x (m), x_dot (m/s), theta (rad), theta_dot (rad/s);
+  none where no states were recorded;
 - ``action`` float32 [rows, m], the m applied forces (a cart-pole's one) ÷ the limit, in [-1, 1];
 - ``teacher_action`` float32 [rows, m], what the teacher would do there, on the same scale;
 - ``ep_len`` int32 and ``ep_offset`` int64 [trajectories], rows of each and its first row.
@@ -40,8 +41,9 @@ def columns(
         joined_n = np.concatenate([first_n[:, None], forces_n], axis=1)
         return (joined_n / force_limit_n).astype(np.float32).reshape(count * rows, -1)
 
+    states = split.states.reshape(count * rows, split.states.shape[-1])
     return {
-        "state": split.states.reshape(count * rows, -1),
+        **({"state": states} if states.shape[1] else {}),
         "action": actions(np.zeros_like(first_teacher_n), split.applied_n),
         "teacher_action": actions(first_teacher_n, split.teacher_n),
         "ep_len": np.full(count, rows, np.int32),
@@ -58,8 +60,8 @@ def write_hdf5(
 ) -> None:
     """Write the columns as one HDF5 file, atomically; equal data give equal bytes.
 
-    ``pixels`` are blocks of frames [n, H, W, 3] in row order, or ``None`` to leave the column out;
-    ``frame_shape`` is (H, W, 3), ``about`` plain JSON data for the attribute ``hjepa``.
+    ``pixels`` are blocks of frames [n, H, W, C] in row order, or ``None`` to leave the column out;
+    ``frame_shape`` is (H, W, C), ``about`` plain JSON data for the attribute ``hjepa``.
 
     Raises:
         MissingInputError: h5py is not installed.
@@ -78,7 +80,7 @@ def write_hdf5(
         for name, array in values.items():
             file.create_dataset(name, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
         if pixels is not None:
-            shape = (len(values["state"]), *frame_shape)
+            shape = (len(values["action"]), *frame_shape)
             # A frame per chunk, as peers read single rows; gzip makes it 50 times smaller.
             column = file.create_dataset(
                 "pixels", shape, np.uint8, maxshape=(None, *frame_shape),
@@ -115,7 +117,7 @@ def write_npz(
         for name, array in arrays.items():
             put(name, iter([array]), array.shape)
         if pixels is not None:
-            put("pixels", pixels, (len(values["state"]), *frame_shape))
+            put("pixels", pixels, (len(values["action"]), *frame_shape))
 
 
 def blocks(split: Trajectories, frames: Frames, tick: Callable[[int], None]) -> Iterator[Any]:

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.control.drivers import Driver
 from hjepa_cli.core.control.force_error import control_error
 from hjepa_cli.core.control.loop import last_states
 from hjepa_cli.core.evaluation.bench import Facts
 from hjepa_cli.core.evaluation.simulator import Simulator, Tick
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class ControlErrors:
             driver,
             self.states,
             self.teacher_n,
-            plant(settings.plant).force_limit_n,
+            plant_of(settings).force_limit_n,
             settings.protocol.horizon,
             every_packet=self.every_packet,
         )
@@ -39,7 +39,7 @@ class ControlErrors:
 
 def control_errors(
     driver: Driver,
-    states: Floats,
+    states: Floats | Pixels,
     teacher_n: Floats,
     force_limit_n: float,
     horizon: int,
@@ -50,7 +50,8 @@ def control_errors(
 
     Args:
         driver: what drives.
-        states: rollouts [R, steps + 1, S]; index 0 is the frame before k = 0.
+        states: rollouts [R, steps + 1, S]; index 0 is the frame before k = 0. Of recordings it is
+            their frames uint8 [R, steps + 1, H, W, C].
         teacher_n: the teacher's forces on them [R, steps, *A].
         force_limit_n: half of the force range.
         horizon: last j; the packet at k = 0 is j = 0.

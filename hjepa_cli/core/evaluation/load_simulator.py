@@ -25,11 +25,13 @@ from hjepa_cli.core.evaluation.load_search import (
 )
 from hjepa_cli.core.evaluation.simulator import Simulator, Tick
 from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.radio.cell import physical_layer
 from hjepa_cli.core.radio.channel import thermal_noise_dbm
-from hjepa_cli.core.radio.coding import round_errors
+from hjepa_cli.core.radio.doppler import FLAT, Motion, doppler_hz, tapped_delay_line
 from hjepa_cli.core.radio.factory_hall import drop_devices, power_margin_db
 from hjepa_cli.core.radio.laws.scheduled import SupportedLoad
 from hjepa_cli.core.radio.uplink import Access
+from hjepa_cli.plugins import SCHEDULERS
 
 T = TypeVar("T")
 
@@ -58,6 +60,8 @@ class OneLoad:
         radio, devices = settings.radio, round(self.load * blocks)
         margin_db, k_factor_db = _links(radio, self.snr_db, seed, devices)
         method, levels = simulator.driver(self.method), None
+        granted = None if SCHEDULERS[self.scheduler].in_turn else True
+        carried = simulator.phy.carries(method.bits_per_transmission, self.snr_db, dynamic=granted)
         if radio.uncertainty == "levels" and method.two_levels:
             method = dataclasses.replace(method, controller=method.two_levels)
             levels = simulator.measured(measure_levels, method, seed)
@@ -67,15 +71,13 @@ class OneLoad:
             margin_db=margin_db,
             k_factor_db=k_factor_db,
             coherence_slots=radio.coherence_slots,
-            round_errors=round_errors(
-                method.bits_per_transmission + radio.overhead_bits,
-                self.snr_db,
-                radio.block_error,
-                radio.harq_rounds,
-            ),
+            round_errors=carried.round_errors,
             growth=levels.growth if levels else simulator.measured(measure_growth, method, seed),
             seed=seed,
             levels=levels,
+            round_trip_slots=carried.round_trip_slots,
+            reports=simulator.phy.reports(devices, self.snr_db),
+            motion=simulator.motion(carried.allocation_hz),
         )
         outcome = simulate_cell(
             simulator.plant, settings.protocol, seed, devices, access, method, tick=tick
@@ -134,8 +136,21 @@ class LoadSimulator(Simulator):
 
     def __init__(self, settings: Settings, model: Model | None) -> None:
         super().__init__(settings, model)
+        self.phy = physical_layer(settings.radio, settings.nr, self.plant.step_s)
         self._calibrated: dict[tuple[Any, ...], Any] = {}
         self._teacher: dict[int, Floats] = {}
+
+    def motion(self, allocation_hz: float) -> Motion | None:
+        """Return how links move that send on a part of the band; ``None``: fades are blocks."""
+        radio = self.settings.radio
+        if radio.fading == "block":
+            return None
+        taps = FLAT
+        if radio.fading != "jakes":
+            profile = radio.fading.removeprefix("tdl-")
+            taps = tapped_delay_line(profile, radio.delay_spread_s, radio.carrier_ghz)
+        shift_hz = doppler_hz(radio.speed_m_s, radio.carrier_ghz)
+        return Motion(shift_hz, self.plant.step_s, taps, radio.bandwidth_hz, allocation_hz)
 
     def measured(self, measure: Callable[..., T], method: Driver, seed: int) -> T:
         """Return what is calibrated of a method once per seed."""

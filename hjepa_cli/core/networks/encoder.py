@@ -2,8 +2,9 @@
 
 A residual network with three stages of 64, 128 and 256 channels keeps a 2 × 4 map to its last
 layer, because a cart-pole is where things are: global average pooling would throw the positions
-away. Frames travel as uint8 [N, κ, H, W, 3], the current one last, which is already channels-last
-memory, the layout the convolutions are fastest in.
+away. Frames of other sizes have as many stages as leave two to four rows (or columns, where there
+are fewer of them). Frames travel as uint8 [N, κ, H, W, C], the current one last, which is already
+channels-last memory, the layout the convolutions are fastest in.
 """
 
 import copy
@@ -24,10 +25,26 @@ from hjepa_cli.core.networks.symmetry import (
     flatten_twins,
     linear_layers,
 )
-from hjepa_cli.core.plants.frames import CHANNELS, HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.frames import FRAME_SHAPE
 
 STEM_PX, STEM_CHANNELS = 4, 64
-MAP_PX, MAP_CHANNELS = 32, 128  # a value of the last map stands for that many pixels, squared
+MAP_CHANNELS = 128
+LEAST_ROWS = 2  # of the last map
+WIDEST = 256  # channels of a stage
+
+
+def stages_of(height_px: int, width_px: int) -> int:
+    """Return how many stages of stride 2 follow the stem, at least one."""
+    return max(int(math.log2(min(height_px, width_px) / (STEM_PX * LEAST_ROWS))), 1)
+
+
+def map_of(height_px: int, width_px: int) -> tuple[int, int]:
+    """Return rows and columns of the last map; a value stands for that share of the picture.
+
+    Where they do not divide the picture, it is widened by copies of its border.
+    """
+    pixels = STEM_PX * 2 ** stages_of(height_px, width_px)
+    return -(-height_px // pixels), -(-width_px // pixels)
 
 
 def normalise(z: Tensor) -> Tensor:
@@ -69,7 +86,7 @@ class ResidualBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Ψ_θ maps uint8 frames [N, κ, 64, 128, 3] to embeddings [N, D] of length √D.
+    """Ψ_θ maps uint8 frames [N, κ, H, W, C] to embeddings [N, D] of length √D.
 
     Args:
         embedding: D, 256 in the paper.
@@ -83,6 +100,7 @@ class Encoder(nn.Module):
         symmetric: whether the embedding of a mirrored picture is the reflected embedding; D is
             even then, and the offset is on the even half.
         frames: κ, the current one and κ − 1 earlier ones.
+        frame_shape: (H, W, C).
     """
 
     input_mean: Tensor
@@ -96,22 +114,29 @@ class Encoder(nn.Module):
         centre: bool,
         symmetric: bool = False,
         frames: int = 2,
+        frame_shape: tuple[int, int, int] = FRAME_SHAPE,
     ) -> None:
         super().__init__()
         self.embedding, self.frame_input, self.symmetric = embedding, frame_input, symmetric
-        channels = frames * CHANNELS
+        *size, colours = frame_shape
+        channels, rows_columns = frames * colours, map_of(*size)
+        pixels = STEM_PX * 2 ** stages_of(*size)
+        self.border_px = tuple(pixels * n - px for n, px in zip(rows_columns, size, strict=True))
+        widths = [min(STEM_CHANNELS * 2**i, WIDEST) for i in range(stages_of(*size))]
         self.register_buffer("input_mean", torch.zeros(channels))
         self.register_buffer("input_std", torch.ones(channels))
         halves = 2 if symmetric else 1
         self.stem = nn.Conv2d(channels, STEM_CHANNELS // halves, STEM_PX, STEM_PX, bias=False)
         self.stem_norm = (MirrorNorm2d if symmetric else nn.BatchNorm2d)(STEM_CHANNELS)
         self.stages = nn.Sequential(
-            ResidualBlock(STEM_CHANNELS, 64, 2, symmetric=symmetric),
-            ResidualBlock(64, 128, 2, symmetric=symmetric),
-            ResidualBlock(128, 256, 2, symmetric=symmetric),
+            *(
+                ResidualBlock(into, out, 2, symmetric=symmetric)
+                for into, out in pairwise([STEM_CHANNELS, *widths])
+            )
         )
-        features = MAP_CHANNELS * (HEIGHT_PX // MAP_PX) * (WIDTH_PX // MAP_PX)
-        self.squeeze = (MirrorConv2d if symmetric else nn.Conv2d)(256, MAP_CHANNELS, 1, bias=True)
+        features = MAP_CHANNELS * math.prod(rows_columns)
+        last = (MirrorConv2d if symmetric else nn.Conv2d)(widths[-1], MAP_CHANNELS, 1, bias=True)
+        self.squeeze = last
         (self.head,) = linear_layers(features, embedding_signs(embedding), mirrored=symmetric)
         self.centre: nn.Module | None = None
         if centre:
@@ -126,20 +151,21 @@ class Encoder(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def fit_standardisation(self, frames: Tensor) -> None:
-        """Measure mean and deviation of every channel on uint8 frames [N, κ, 64, 128, 3]."""
+        """Measure mean and deviation of every channel on uint8 frames [N, κ, H, W, C]."""
         inputs = self.inputs(frames)
         flat = inputs.permute(0, 2, 3, 1).reshape(-1, inputs.shape[1]).float()
         self.input_mean.copy_(flat.mean(0))
         self.input_std.copy_(flat.std(0).clamp_min(1e-3))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Map uint8 frames [N, κ, 64, 128, 3] to float32 embeddings [N, D]."""
+        """Map uint8 frames [N, κ, H, W, C] to float32 embeddings [N, D]."""
         return self.embed(self.inputs(frames))
 
     def embed(self, x: Tensor) -> Tensor:
-        """Map what :meth:`inputs` returns, [N, 3κ, 64, 128], to float32 embeddings [N, D]."""
+        """Map what :meth:`inputs` returns, [N, Cκ, H, W], to float32 embeddings [N, D]."""
         if not torch.is_autocast_enabled(x.device.type):
             x = x.float()
+        x = self._widened(x)
         x = F.relu(self.stem_norm(F.conv2d(x, *self._stem(), stride=STEM_PX)))
         x = F.relu(self.squeeze(self.stages(x)))
         z = self.head(flatten_twins(x) if self.symmetric else x.flatten(1)).float()
@@ -160,6 +186,13 @@ class Encoder(nn.Module):
                 _fold(block, *pair)
         return frozen
 
+    def _widened(self, x: Tensor) -> Tensor:
+        """Repeat the border of pictures [N, C, H, W] until all stages divide them."""
+        if not any(self.border_px):
+            return x
+        (top, bottom), (left, right) = ((px // 2, px - px // 2) for px in self.border_px)
+        return F.pad(x, (left, right, top, bottom), mode="replicate")
+
     def _stem(self) -> tuple[Tensor, Tensor]:
         """Return the stem's weights and offset with the standardisation inside.
 
@@ -174,9 +207,9 @@ class Encoder(nn.Module):
         return weight, offset
 
     def inputs(self, frames: Tensor) -> Tensor:
-        """Return what the network sees of frames [N, κ, 64, 128, 3], the present first.
+        """Return what the network sees of frames [N, κ, H, W, C], the present first.
 
-        It is [N, 3κ, 64, 128] in bfloat16: pixels and their differences are exact in it.
+        It is [N, Cκ, H, W] in bfloat16: pixels and their differences are exact in it.
         """
         seen = [frame.bfloat16() for frame in reversed(frames.unbind(1))]
         earlier = seen[1:]

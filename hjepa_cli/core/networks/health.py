@@ -30,6 +30,29 @@ def probe_r2(
     return dict(zip(names, found, strict=True))
 
 
+def action_r2(
+    train_z: Tensor, train_actions: Tensor, test_z: Tensor, test_actions: Tensor, steps: int
+) -> float | None:
+    """Return the held-out R² of reading a stride's mean action off the embeddings at its ends.
+
+    It is the linear probe of inverse dynamics: embeddings [N, K, D], and actions [N, K, *A] from
+    each to the next, of which ``steps`` make a stride. Actions that do not vary have none.
+    """
+
+    def ends(z: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        means = actions.unfold(1, steps, 1).mean(-1)[:, : z.shape[1] - steps]
+        pairs = torch.cat([z[:, :-steps], z[:, steps:]], dim=-1)
+        return pairs.flatten(0, 1), means.reshape(len(z) * means.shape[1], -1)
+
+    (fit_pairs, fit_means), (pairs, means) = (
+        ends(train_z, train_actions),
+        ends(test_z, test_actions),
+    )
+    residual = means.double() - read_probe(fit_probe(fit_pairs, fit_means), pairs)
+    spread = (means - means.mean(0)).double().square().sum()
+    return float(1.0 - residual.square().sum() / spread) if spread > 0 else None
+
+
 def fit_probe(z: Tensor, states: Tensor) -> Tensor:
     """Return weights [D + 1, S], float64, of least squares from embeddings [N, D] to [N, S]."""
     design = _with_intercept(z)

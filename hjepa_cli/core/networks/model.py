@@ -21,8 +21,7 @@ from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
 from hjepa_cli.core.networks.outside import embeddings_from, frames_from
 from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
-from hjepa_cli.core.plants.frames import FRAME_SHAPE
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.plugins import METHODS
@@ -73,10 +72,11 @@ def build_modules(
     embedding, frames = architecture["embedding"], architecture.get("frames", 2)
     symmetric = architecture["mirror"] == "exact"
     mirror = force_signs if symmetric else None
+    frame_shape = camera_in(architecture).frame_shape
 
     def encoder() -> Encoder:
         frame_input, centre = architecture["frame_input"], architecture["centre"]
-        return Encoder(embedding, frame_input, centre, symmetric, frames)
+        return Encoder(embedding, frame_input, centre, symmetric, frames, frame_shape)
 
     def actor() -> Actor:
         hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
@@ -110,7 +110,7 @@ def build_modules(
             embedding, architecture["hidden"], 0, guided=True, mirror=mirror
         )
     if kind == "autoencoder":
-        modules["decoder"] = Decoder(embedding, frames, symmetric)
+        modules["decoder"] = Decoder(embedding, frames, symmetric, frame_shape)
         modules["reader"] = encoder()
     if kind != "encoder":
         modules["actor"] = actor()
@@ -150,8 +150,9 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
             changed since.
     """
     metadata, found = check_metadata(checkpoint), f"checkpoint {checkpoint.path}"
-    architecture, kind = metadata["architecture"], plant(metadata["plant"])
-    if "camera" in metadata and not same_camera(metadata["camera"], kind):
+    architecture, kind = metadata["architecture"], plant_in(metadata["plant"], metadata["settings"])
+    camera = camera_of(kind, camera_in(metadata["settings"]))
+    if "camera" in metadata and not same_camera(metadata["camera"], camera):
         raise DataError(
             f"{found} was trained on another camera's pictures than plant {kind.name} has now",
             hint="train it again",
@@ -201,7 +202,8 @@ def check_metadata(checkpoint: Checkpoint) -> Mapping[str, Any]:
                 for name, value in metadata["architecture"].items()
             )
         )
-        plant(metadata["plant"])
+        plant_in(metadata["plant"], metadata["settings"])
+        good &= camera_in(metadata["architecture"]) == camera_in(metadata["settings"])
     except (KeyError, TypeError, ValueError, UsageError):
         good = False
     if not good:
@@ -265,9 +267,10 @@ class Model:
         self.metadata, self.digest = metadata, digest
         self.plant_name: str = metadata["plant"]
         self.precision: str = metadata["settings"]["encoder"]["precision"]
-        kind = plant(self.plant_name)
+        self.plant = kind = plant_in(self.plant_name, metadata["settings"])
         self.force_limit_n, self.action_shape = kind.force_limit_n, kind.action_shape
         self.frames: int = self.architecture.get("frames", 2)
+        self.camera = camera_of(kind, camera_in(self.architecture))
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
         is_reflex = self.architecture["kind"] == "reflex"
@@ -296,7 +299,7 @@ class Model:
         return Strides(*(self.architecture[name] for name in "hml"))
 
     def encode(self, frames: NDArray[np.uint8]) -> Tensor:
-        """Encode frames uint8 [N, κ, 64, 128, 3], the current one last: float32 [N, D].
+        """Encode frames uint8 [N, κ, H, W, C], the current one last: float32 [N, D].
 
         Raises:
             ArrayError: another type or shape; the message says which, and their range.
@@ -304,7 +307,7 @@ class Model:
         """
         return encode_frames(
             functools.partial(read_frames, self.networks),
-            frames_from(frames, (self.frames, *FRAME_SHAPE)),
+            frames_from(frames, (self.frames, *camera_in(self.architecture).frame_shape)),
             device=self.device,
             precision=self.precision,
         )

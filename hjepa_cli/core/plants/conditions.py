@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import ConditionSettings, EncoderSettings
+from hjepa_cli.config.schema import ConditionSettings, EncoderSettings, Settings
 from hjepa_cli.core.arrays import Floats, Pixels
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.frames import FRAME_SHAPE
+from hjepa_cli.core.plants.named import camera_of, plant
 from hjepa_cli.core.plants.system import Camera, System
 
 NOMINAL = {"light": 1.0, "camera_noise": 0.0, "pole_length": 1.0}
@@ -39,12 +40,13 @@ def actual_plant(name: str, conditions: ConditionSettings) -> System:
     return kind if scale == 1.0 else kind.with_pole_length(scale)
 
 
-def actual_camera(name: str, conditions: ConditionSettings, seed: int) -> Camera:
-    """Return the camera that looks at them."""
-    camera = actual_plant(name, conditions).camera()
+def actual_camera(settings: Settings) -> Camera:
+    """Return the camera that looks at the devices of some settings."""
+    conditions = settings.conditions
+    camera = camera_of(actual_plant(settings.plant, conditions), settings.camera)
     if (conditions.light, conditions.camera_noise) == (1.0, 0.0):
         return camera
-    return Disturbed(camera, conditions.light, conditions.camera_noise, seed)
+    return Disturbed(camera, conditions.light, conditions.camera_noise, settings.seed)
 
 
 class Disturbed:
@@ -58,9 +60,10 @@ class Disturbed:
 
     def __init__(self, camera: Camera, light: float, noise: float, seed: int) -> None:
         self._camera, self._light, self._noise, self._seed = camera, light, noise, seed
+        self.frame_shape = getattr(camera, "frame_shape", FRAME_SHAPE)
 
     def render(self, states: ArrayLike) -> Pixels:
-        """Return RGB frames ``[n, 64, 128, 3]`` of states ``[n, S]``."""
+        """Return frames ``[n, H, W, C]`` of states ``[n, S]``."""
         drawn = zlib.crc32(np.ascontiguousarray(states, np.float64).tobytes())
         random = generator(self._seed, _NOISE_KEY, drawn)
         return disturbed(self._camera.render(states), self._light, self._noise, random)

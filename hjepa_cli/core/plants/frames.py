@@ -1,4 +1,6 @@
-"""Camera frames have one size, and a device remembers some of them for its network."""
+"""Camera frames have a usual size, and a device remembers some of them for its network."""
+
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,8 +10,12 @@ from hjepa_cli.core.plants.system import Camera
 
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 FRAME_SHAPE = (HEIGHT_PX, WIDTH_PX, CHANNELS)
-FRAME_BITS = HEIGHT_PX * WIDTH_PX * CHANNELS * 8  # uncompressed
 LONGEST = 4  # frames, κ; a device keeps so many
+
+
+def frame_bits(frame_shape: tuple[int, int, int]) -> int:
+    """Return the bits of an uncompressed frame of (H, W, C) values."""
+    return 8 * math.prod(frame_shape)
 
 
 def frames_seen(k: ArrayLike, frames: int) -> Integers:
@@ -22,7 +28,7 @@ def frames_seen(k: ArrayLike, frames: int) -> Integers:
 
 
 def frames_of(camera: Camera, states: ArrayLike, batch: int | None = None) -> Pixels:
-    """Render states [N, …, S] into frames uint8 [N, …, 64, 128, 3].
+    """Render states [N, …, S] into frames uint8 [N, …, H, W, C]: 64 × 128 × 3, or ``frame_shape``.
 
     ``batch`` of the N are rendered at a time, which bounds the memory; all by default.
 
@@ -30,10 +36,11 @@ def frames_of(camera: Camera, states: ArrayLike, batch: int | None = None) -> Pi
         NumericalError: a state is not finite.
     """
     states = finite(states, "states")
-    frames = np.empty((*states.shape[:-1], *FRAME_SHAPE), np.uint8)
+    shape = getattr(camera, "frame_shape", FRAME_SHAPE)
+    frames = np.empty((*states.shape[:-1], *shape), np.uint8)
     for start in range(0, len(states), batch or max(len(states), 1)):
         part = slice(start, start + (batch or len(states)))
-        frames[part].reshape(-1, *FRAME_SHAPE)[:] = camera.render(
+        frames[part].reshape(-1, *shape)[:] = camera.render(
             states[part].reshape(-1, states.shape[-1])
         )
     return frames

@@ -2,18 +2,25 @@
 
 import hashlib
 import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hjepa_cli import plugins
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import CameraSettings, RecordedSettings, Settings
 from hjepa_cli.core.arrays import Floats, array_from, described, finite
 from hjepa_cli.core.plants.cartpole import camera
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
+from hjepa_cli.core.plants.cartpole.simulation import CartPoles
+from hjepa_cli.core.plants.frames import FRAME_SHAPE
+from hjepa_cli.core.plants.recorded import Recorded, RecordedCamera
+from hjepa_cli.core.plants.resizing import Resized
+from hjepa_cli.core.plants.system import Camera as SystemCamera
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.errors import ArrayError, UsageError
 
@@ -38,12 +45,16 @@ def plant_of(settings: Settings) -> System:
         UsageError: they do not.
     """
     kind = plant(settings.plant)
-    for name, values in (
+    checked = [
         ("collect.start", settings.collect.half_widths),
         ("encoder.gate_r2", settings.encoder.least_r2),
         ("protocol.start", settings.protocol.half_widths),
         ("protocol.noise", settings.protocol.velocity_noise),
-    ):
+    ]
+    if isinstance(kind, Recorded):
+        kind, gates = Recorded.of(settings.recorded), settings.encoder.gate_r2
+        checked = [("encoder.gate_r2", gates)] if gates else []
+    for name, values in checked:
         if len(values) != len(kind.state_names):
             raise UsageError(
                 f"{name} has {len(values)} values; plant {kind.name} has {len(kind.state_names)} "
@@ -52,6 +63,41 @@ def plant_of(settings: Settings) -> System:
                 key=name,
             )
     return kind
+
+
+def plant_in(name: str, settings: Mapping[str, Any]) -> System:
+    """Return the plant called ``name`` in a dataset or a checkpoint with these settings.
+
+    Raises:
+        UsageError: there is no such plant, or the settings describe no recorded one.
+    """
+    kind = plant(name)
+    if not isinstance(kind, Recorded):
+        return kind
+    try:
+        return Recorded.of(msgspec.convert(settings["recorded"], RecordedSettings))
+    except (msgspec.ValidationError, LookupError, TypeError) as flaw:
+        raise UsageError(f"a recorded plant without a sound description: {flaw}") from None
+
+
+def camera_in(settings: Mapping[str, Any]) -> CameraSettings:
+    """Return the size of pictures in a dataset or a checkpoint with these settings.
+
+    Raises:
+        UsageError: it is none.
+    """
+    try:
+        return msgspec.convert(settings.get("camera", {}), CameraSettings)
+    except (msgspec.ValidationError, AttributeError) as flaw:
+        raise UsageError(f"no size of pictures: {flaw}") from None
+
+
+def camera_of(kind: System, size: CameraSettings) -> SystemCamera:
+    """Return a plant's camera, its pictures resized by area where ``size`` is not their own."""
+    if isinstance(kind, Recorded):
+        return RecordedCamera(size.frame_shape)
+    camera = kind.camera()
+    return camera if size.frame_shape == FRAME_SHAPE else Resized(camera, size.frame_shape)
 
 
 def definition(name: str) -> str | None:
@@ -127,7 +173,6 @@ class CartPole:
     """
 
     def __init__(self, preset: CartPolePlant | str, *, seed: int | None = None) -> None:
-        from hjepa_cli.core.plants.cartpole.simulation import CartPoles  # pymunk, as plant.py does
 
         self._poles = CartPoles(cart_pole(preset), 1)
         self.plant = self._poles.plant

@@ -144,9 +144,9 @@ class Camera(Protocol):
         """
 
 
-def same_camera(recorded: object, system: "System") -> bool:
-    """Say whether a file's pictures are of the system's camera, by the manifest that it holds."""
-    return bool(recorded == json.loads(json.dumps(system.camera().manifest())))
+def same_camera(recorded: object, camera: Camera) -> bool:
+    """Say whether a file's pictures are of a camera, by the manifest that it holds."""
+    return bool(recorded == json.loads(json.dumps(camera.manifest())))
 
 
 class System(abc.ABC):

@@ -1,72 +1,19 @@
-"""A radio cell has links and slots, as all laws see them; SNRs are read as users give them.
+"""A slot of a band has a capacity; SNRs are read as users give them.
 
 A cell of W hertz has slots of one control step τ_o; a packet has b bits, the SNR is γ̄.
 """
 
-import dataclasses
 from decimal import Decimal, InvalidOperation
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from hjepa_cli.config.schema import RadioSettings
 from hjepa_cli.core.arrays import Floats, Integers
-from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.radio.channel import ROUNDING, SNR_DB, achievable_rate_bps, positive
 from hjepa_cli.errors import UsageError
 
-Noise = Literal["fixed", "scaled"]
-
 DEFAULT_STEP_DB = 5
 MAX_SNR_POINTS = 500
-
-
-@dataclasses.dataclass(frozen=True)
-class Link:
-    """Carries the packets of one device in a cell.
-
-    Attributes:
-        payload_bits: b.
-        bandwidth_hz: W, of the cell.
-        slot_s: τ_o.
-        snr_db: γ̄.
-        noise: its power is fixed, or scaled with a device's own share of the band.
-    """
-
-    payload_bits: int
-    bandwidth_hz: float
-    slot_s: float
-    snr_db: float
-    noise: Noise = "fixed"
-
-    @property
-    def packets_per_slot(self) -> float:
-        """Return c; see :func:`slot_capacity`."""
-        return float(slot_capacity(self.payload_bits, self.bandwidth_hz, self.slot_s, self.snr_db))
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """Holds loops, in slots of a control step of the plants; values as of :class:`Link`.
-
-    ``limit_bits_per_s`` is λ/ln 2, what stabilising one plant takes at least; 0 if it is stable.
-    """
-
-    bandwidth_hz: float
-    slot_s: float
-    limit_bits_per_s: float
-    noise: Noise = "fixed"
-
-    @classmethod
-    def of(cls, radio: RadioSettings, plant: System) -> "Cell":
-        """Return the cell of the settings with such plants."""
-        limit = plant.data_rate_limit_bits_per_s
-        return cls(radio.bandwidth_hz, plant.step_s, limit, radio.noise)
-
-    def link(self, payload_bits: int, snr_db: float) -> Link:
-        """Return the link of a device whose packets have ``payload_bits``."""
-        return Link(payload_bits, self.bandwidth_hz, self.slot_s, snr_db, self.noise)
 
 
 def slot_capacity(

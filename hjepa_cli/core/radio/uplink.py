@@ -6,6 +6,7 @@ target SNR; a device in a fade deeper than its power margin cannot send at all.
 
 import dataclasses
 import math
+from collections import deque
 
 import numpy as np
 
@@ -13,12 +14,15 @@ from hjepa_cli.compute.seeding import generator
 from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.core.control.disagreement import LevelDisagreement
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable
+from hjepa_cli.core.radio.doppler import Motion, moving_fading
 from hjepa_cli.core.radio.fading import block_fading
+from hjepa_cli.core.radio.phy.phy import Reports
+from hjepa_cli.core.radio.phy.shannon import INNOVATION_BITS
 from hjepa_cli.core.radio.schedulers.scheduler import SlotView, pick
 from hjepa_cli.errors import UsageError
 from hjepa_cli.plugins import SCHEDULERS
 
-INNOVATION_BITS = 8  # of a report
+EIGHT_BITS = Reports(INNOVATION_BITS)
 CHECK_PERIOD = 8  # slots between a device's looks at its own camera, staggered over devices
 REPORT_AGAIN = 2.0  # times the last report: an innovation is reported once, and when it doubles
 REPORTS_PER_BLOCK = 1.0  # that δ is steered to: a candidate for every transmission
@@ -42,6 +46,9 @@ class Access:
         growth: of the control error with age, measured for the controller.
         seed: of the fading.
         levels: scales the growth by the disagreement of a controller's two levels, if it has them.
+        round_trip_slots: from one copy of a sample to the next, at least.
+        reports: what innovations are reported with.
+        motion: of the devices; without one fades last ``coherence_slots``.
     """
 
     scheduler: str
@@ -53,11 +60,9 @@ class Access:
     growth: ErrorGrowthTable
     seed: int
     levels: LevelDisagreement | None = None
-
-
-def report_bits(devices: int) -> int:
-    """Return the bits of a report in a cell of N devices: 8 for how far, ⌈log2 N⌉ for who."""
-    return INNOVATION_BITS + math.ceil(math.log2(max(devices, 1)))
+    round_trip_slots: int = 1
+    reports: Reports = EIGHT_BITS
+    motion: Motion | None = None
 
 
 class Uplink:
@@ -75,11 +80,16 @@ class Uplink:
             )
         self._access = access
         self._score, self.listens = scheduler.score, scheduler.wants_reports
-        self._fading = block_fading(
-            access.seed,
-            devices,
-            k_factor_db=access.k_factor_db,
-            coherence_slots=access.coherence_slots,
+        k_factor_db = access.k_factor_db
+        self._fading = (
+            moving_fading(access.seed, devices, access.motion, k_factor_db=k_factor_db)
+            if access.motion
+            else block_fading(
+                access.seed,
+                devices,
+                k_factor_db=k_factor_db,
+                coherence_slots=access.coherence_slots,
+            )
         )
         self._errors = generator(access.seed, _ERRORS_KEY)
         self._round_errors = np.array(access.round_errors)
@@ -96,6 +106,8 @@ class Uplink:
         self._waited = np.arange(devices, 0, -1)
         self._queue = np.zeros(devices)
         self._reported = np.zeros(devices)
+        # What the base station knows of it: reports take a while.
+        self._on_their_way = deque([np.zeros(devices)], maxlen=access.reports.delay_slots + 1)
         self._uncertainty = np.ones(devices)
         # Copies that were lost of the sample a device is repeating, and slots since it was taken.
         self._lost = np.zeros(devices, dtype=np.int64)
@@ -125,8 +137,7 @@ class Uplink:
 
     def hear(self, devices: Bools, innovation: Floats) -> None:
         """Take the innovations |C(z) − ũ| ÷ the force range of ``devices``; some report."""
-        steps = 2**INNOVATION_BITS
-        sent = (np.minimum(np.floor(innovation * steps), steps - 1) + 0.5) / steps
+        sent = self._told(innovation)
         reports = innovation >= self._delta
         reports &= sent >= REPORT_AGAIN * self._reported[devices]
         who = np.flatnonzero(devices)[reports]
@@ -142,19 +153,22 @@ class Uplink:
 
         In the very first slot everybody's does: loops start with a known state.
         """
+        self._on_their_way.append(self._reported.copy())
         view = SlotView(
             age=self._age,
             waited=self._waited,
             gain=self._gain,
             power=self._power,
             queue=self._queue,
-            reported=self._reported,
+            reported=self._on_their_way[0],
             growth=self._access.growth,
             uncertainty=self._uncertainty,
         )
+        trips = self._lost * self._access.round_trip_slots
         repeats = (self._lost > 0) & self._able  # a copy that waits is worth less every slot
-        scores = self._checked(self._score(view))
-        chosen = pick(np.where(repeats, np.inf, scores), self._access.blocks)
+        scores = np.where(repeats, np.inf, self._checked(self._score(view)))
+        scores = np.where(self._behind < trips, 0.0, scores)  # the base station has yet to answer
+        chosen = pick(scores, self._access.blocks)
         sent = chosen & self._able if self._slot else np.ones_like(chosen)
         failed = self._errors.random(len(chosen)) < self._round_errors[self._lost]
         arrived = sent & ~failed if self._slot else sent
@@ -167,8 +181,19 @@ class Uplink:
         self._age = np.where(arrived, self._behind, self._age) + 1
         self._behind = np.where(self._lost > 0, self._behind + 1, 0)
         self._reported[arrived] = 0.0
+        for told in self._on_their_way:  # a report of before the packet says nothing any more
+            told[arrived] = 0.0
         self._slot += 1
         return arrived
+
+    def _told(self, innovation: Floats) -> Floats:
+        """Return the innovations as reports say them: in 8 bits, or in a few levels from δ on."""
+        if levels := self._access.reports.levels:
+            with np.errstate(divide="ignore"):
+                level = np.floor(np.log2(innovation / self._delta))
+            return np.asarray(self._delta * 2.0 ** (np.clip(level, 0, levels - 1) + 0.5))
+        steps = 2**INNOVATION_BITS
+        return np.asarray((np.minimum(np.floor(innovation * steps), steps - 1) + 0.5) / steps)
 
     def _checked(self, scores: object) -> Floats:
         """Return scores; raise UsageError where they are none. It costs little beside a slot."""

@@ -65,7 +65,7 @@ def _listen(
     delivered[0] = True
 
     conditions = ConditionSettings() if exact else settings.conditions
-    camera = actual_camera(settings.plant, conditions, seed)
+    camera = actual_camera(dataclasses.replace(settings, conditions=conditions, seed=seed))
     send = None if exact else coder_of(settings, model).send
     sense, clean = embedding_sensor(model, send, camera), embedding_sensor(model)
     heard: list[tuple[Tensor, Tensor, Tensor]] = []

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hjepa_cli.core.plants.frames import frames_seen
+from hjepa_cli.core.plants.frames import WIDTH_PX, frames_seen
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.core.training.batches import Labels
 
@@ -58,7 +58,8 @@ def labels_of(split: RenderedSplit, kind: System, act: Teacher) -> Labels:
         if not shifts_px.any():
             return split.labels[trajectories, k]
         states = split.states[trajectories, k].numpy().astype(float)
-        forces_n = act(kind.sideways(states, shifts_px))
+        own_px = shifts_px * (WIDTH_PX / split.frames.shape[-2])  # in the camera's own pictures
+        forces_n = act(kind.sideways(states, own_px))
         return torch.from_numpy(forces_n / kind.force_limit_n).to(split.labels.dtype)
 
     return labels

@@ -45,7 +45,7 @@ def _decoded_on_the_device(settings: Settings, model: Model) -> Driver:
     act = control_law(kind, settings.control)
     controls = reader.quantised, np.asarray, act, kind.force_limit_n
     drives = functools.partial(KalmanController, *controls)
-    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    camera = actual_camera(settings)
     embed = embedding_sensor(model, camera=camera)
 
     def sense(seen: Floats) -> Floats:

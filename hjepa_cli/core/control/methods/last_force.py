@@ -38,7 +38,7 @@ def _local(settings: Settings, model: Model) -> Driver:
     from hjepa_cli.core.control.sensors import embedding_sensor
     from hjepa_cli.core.plants.conditions import actual_camera
 
-    camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+    camera = actual_camera(settings)
     sensor, drives = embedding_sensor(model, camera=camera), last_force(model)
     return Driver("local", sensor, drives, drives, 0, "local", uses_link=False)
 

@@ -25,14 +25,15 @@ def _method(kind: str, frames: int, style: Style) -> Method:
         from hjepa_cli.core.control.drivers import Driver, last_force
         from hjepa_cli.core.control.sensors import camera_sensor
         from hjepa_cli.core.plants.conditions import actual_camera
-        from hjepa_cli.core.plants.frames import FRAME_BITS
+        from hjepa_cli.core.plants.frames import frame_bits
 
         def act(seen: NDArray[np.uint8]) -> Tensor:
             return model.actor(model.encode(seen).to(model.device))
 
-        camera = actual_camera(settings.plant, settings.conditions, settings.seed)
+        bits = frame_bits(settings.camera.frame_shape)
+        camera = actual_camera(settings)
         look, drives = camera_sensor(model, camera), last_force(model, act)
-        return Driver(name, look, drives, drives, frames * FRAME_BITS, name)
+        return Driver(name, look, drives, drives, frames * bits, name)
 
     return Method(
         name,

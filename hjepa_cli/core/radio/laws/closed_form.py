@@ -9,14 +9,14 @@ from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any
 
-from hjepa_cli.core.radio.capacity import Cell, Link
+from hjepa_cli.core.radio.cell import Cell, Link
 from hjepa_cli.core.radio.laws.law import Row, SharingLaw
 from hjepa_cli.core.radio.laws.requirement import Axis, LinkRequirement
 from hjepa_cli.plugins import LAWS, check_members
 
 
 def _too_crowded(tolerance: float, loop: LinkRequirement, link: Link) -> str:
-    return f"a packet takes {1 / link.packets_per_slot:.3g} slots; one device alone does not fit"
+    return f"{link.carried.described}; one device alone does not fit"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,6 +87,9 @@ class ClosedFormLaw(SharingLaw):
         ends = loop.interval or (loop.tolerance, loop.tolerance)
         row["devices"] = self.asked("devices", *at)
         row["devices_ci95"] = [self.asked("devices", end, loop, link) for end in ends]
+        row |= link.carried.details
+        if link.packets_per_slot == 0:
+            return row | {"reason": link.carried.described}
         row["load_per_block"] = row["devices"] / link.packets_per_slot
         if row["devices"] == 0:
             # The range of a method ends at its best link, too, if it was measured nowhere else.

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.control.loop import packets_per_step
-from hjepa_cli.core.radio.capacity import Link, late_slots, whole_devices
+from hjepa_cli.core.radio.capacity import whole_devices
+from hjepa_cli.core.radio.cell import Link
 from hjepa_cli.core.radio.channel import positive
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.requirement import GAP, LinkRequirement
@@ -36,20 +37,28 @@ def _period_slots(gap_steps: float, loop: LinkRequirement, link: Link) -> float:
     """Return the mean slots between the packets of a loop that tolerates gaps that long."""
     if not loop.delay_steps:  # else the tolerance was measured with packets that late
         # A packet that is late on arrival has used up that much of the gap it could bridge.
-        gap_steps = max(gap_steps - float(late_slots(link.packets_per_slot)), 0.0)
+        gap_steps = max(gap_steps - link.carried.late_slots, 0.0)
     if gap_steps < 1:
         return gap_steps
     return float(1 / packets_per_step(gap_steps, loop.scored_steps, loop.warmup_steps))
+
+
+def _devices(gap_steps: float, loop: LinkRequirement, link: Link) -> int:
+    if link.packets_per_slot == 0:
+        return 0
+    return int(duty_devices(_period_slots(gap_steps, loop, link), link.packets_per_slot))
+
+
+def _why_nobody(gap_steps: float, loop: LinkRequirement, link: Link) -> str:
+    return f"{link.carried.described} and serves for {gap_steps:.3g}"
 
 
 DUTY = ClosedFormLaw(
     name="duty",
     help="by turns at controlled power",
     axis=GAP,
-    devices=lambda *at: int(duty_devices(_period_slots(*at), at[2].packets_per_slot)),
+    devices=_devices,
     packets_per_slot=lambda *at: 1 / _period_slots(*at),
-    why_nobody=lambda gap_steps, loop, link: (
-        f"a packet takes {1 / link.packets_per_slot:.3g} slots and serves for {gap_steps:.3g}"
-    ),
-    delay_slots=lambda link: float(late_slots(link.packets_per_slot)),
+    why_nobody=_why_nobody,
+    delay_slots=lambda link: link.carried.late_slots,
 )

@@ -5,12 +5,12 @@ How many devices one block carries is found by simulation; here is what that mak
 
 import dataclasses
 
-from hjepa_cli.config.schema import RadioSettings
-from hjepa_cli.core.radio.capacity import Cell, whole_devices
+from hjepa_cli.core.radio.capacity import whole_devices
+from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
-from hjepa_cli.core.radio.coding import packet_uses
 from hjepa_cli.core.radio.laws.law import Row, SharingLaw
-from hjepa_cli.core.radio.uplink import report_bits
+from hjepa_cli.core.radio.phy.phy import Carried
+from hjepa_cli.plugins import SCHEDULERS
 
 SCHEDULED = SharingLaw(
     name="scheduled",
@@ -19,7 +19,8 @@ SCHEDULED = SharingLaw(
         *("radio.schedulers", "radio.uncertainty", "radio.seeds", "radio.power_margin_db"),
         *("radio.coherence_slots", "radio.overhead_bits", "radio.block_error"),
         *("radio.harq_rounds", "radio.topology", "radio.scenario", "radio.carrier_ghz"),
-        *("radio.power_dbm", "radio.noise_figure_db"),
+        *("radio.power_dbm", "radio.noise_figure_db", "radio.fading", "radio.speed_m_s"),
+        *("radio.delay_spread_s", "nr.reports"),
     ),
 )
 
@@ -49,18 +50,18 @@ class SupportedLoad:
 
 @dataclasses.dataclass(frozen=True)
 class ScheduledBand:
-    """Cuts a cell's slots into blocks of one packet each, reports paid for.
+    """Cuts a cell's slots into blocks of one transmission each, reports paid for.
 
-    ``radio`` says how packets are coded, and loads were found at ``acceptable_score``.
+    Loads were found at ``acceptable_score``.
     """
 
     cell: Cell
-    radio: RadioSettings
     acceptable_score: float
 
-    def fits(self, payload_bits: int, snr_db: float) -> bool:
+    def fits(self, scheduler: str, payload_bits: int, snr_db: float) -> bool:
         """Tell whether a slot holds a packet, up to rounding."""
-        return self._slots_per_packet(payload_bits, snr_db) <= 1 + ROUNDING
+        carried = self._carried(scheduler, payload_bits, snr_db)
+        return carried.transmissions_per_slot >= 1 - ROUNDING
 
     def row(
         self,
@@ -74,6 +75,7 @@ class ScheduledBand:
 
         ``found`` is the load of a block, or ``None`` where a packet does not fit into a slot.
         """
+        carried = self._carried(scheduler, payload_bits, snr_db)
         row: Row = {
             "snr_db": snr_db,
             "method": method,
@@ -84,13 +86,13 @@ class ScheduledBand:
             "bits_per_s": None,
             "ratio_to_limit": None,
             "bits_per_transmission": payload_bits,
+            **carried.details,
             "reason": None,
         }
         if found is None:
-            slots = self._slots_per_packet(payload_bits, snr_db)
-            return row | {"reason": f"a packet takes {slots:.3g} slots"}
+            return row | {"reason": carried.described}
         ends = (found.load, *found.interval)
-        devices, *interval = [self._devices(load, found, payload_bits, snr_db) for load in ends]
+        devices, *interval = [self._devices(load, found, carried, snr_db) for load in ends]
         row |= {
             "load_per_block": found.load,
             "load_ci95": list(found.interval),
@@ -99,7 +101,7 @@ class ScheduledBand:
             "reports_per_block_slot": found.reports_per_slot,
             "curve": [{"load": load, "score": score} for load, score in found.points],
             "devices_by_seed": [
-                self._devices(one.load, one, payload_bits, snr_db) for one in found.parts or [found]
+                self._devices(one.load, one, carried, snr_db) for one in found.parts or [found]
             ],
             "devices": devices,
             "devices_ci95": interval,
@@ -107,36 +109,46 @@ class ScheduledBand:
         if found.load == 0:
             score = f"{self.acceptable_score:g}"
             return row | {"reason": f"below {score} even with one device per block"}
-        overhead_bits = self.radio.overhead_bits
-        packets = found.packets_per_slot * (payload_bits + overhead_bits)
-        reports = found.reports_per_slot * (report_bits(devices) + overhead_bits)
-        row["bits_per_s"] = (packets + reports) / found.load / self.cell.slot_s
+        reports = self.cell.phy.reports(devices, snr_db)
+        packets = found.packets_per_slot * (payload_bits + self.cell.phy.overhead_bits)
+        bits = packets + found.reports_per_slot * reports.bits
+        row["bits_per_s"] = bits / found.load / self.cell.slot_s
         if (limit := self.cell.limit_bits_per_s) > 0:
             row["ratio_to_limit"] = row["bits_per_s"] / limit
+        if found.reports_per_slot:
+            blocks = devices / found.load
+            each = found.reports_per_slot * reports.share_each
+            row["reports_share"] = min(reports.share_reserved + blocks * each, 1.0)
         if devices == 0:
             row["reason"] = "fewer than one device"
         return row
 
-    def _devices(self, load: float, found: SupportedLoad, payload_bits: int, snr_db: float) -> int:
-        """Return N = ⌊load · slot ÷ (packet + reports)⌋; the size of reports depends on N."""
-        uses, devices = self._uses(payload_bits, snr_db), 0
-        guess = int(whole_devices(load * self._slot_uses / uses))
-        for _ in range(5):
-            if guess == devices:
-                break
-            devices = guess
-            reports = found.reports_per_slot * self._uses(report_bits(devices), snr_db)
-            guess = int(whole_devices(load * self._slot_uses / (uses + reports)))
-        return guess
+    def _devices(self, load: float, found: SupportedLoad, carried: Carried, snr_db: float) -> int:
+        """Return N = ⌊load · blocks⌋ of a slot, what reports take left out; that depends on N.
 
-    def _slots_per_packet(self, payload_bits: int, snr_db: float) -> float:
-        return self._uses(payload_bits, snr_db) / self._slot_uses
+        More devices never leave more blocks, so that N is what a bisection finds.
+        """
+        most = int(whole_devices(load * carried.transmissions_per_slot))
+        if not found.reports_per_slot or not most:
+            return most
+        few, many = 0, most  # devices that fit, and that may not
+        while few < many:
+            middle = (few + many + 1) // 2
+            if self._fitting(middle, load, found, carried, snr_db) >= middle:
+                few = middle
+            else:
+                many = middle - 1
+        return few
 
-    def _uses(self, bits: int, snr_db: float) -> float:
-        """Return the channel uses of ``bits`` with the overhead of a packet."""
-        sent_bits = bits + self.radio.overhead_bits
-        return packet_uses(sent_bits, snr_db, self.radio.block_error)
+    def _fitting(
+        self, devices: int, load: float, found: SupportedLoad, carried: Carried, snr_db: float
+    ) -> int:
+        """Return how many fit where reports take what those of so many devices do."""
+        reports = self.cell.phy.reports(devices, snr_db)
+        each = 1 / carried.resource_transmissions + found.reports_per_slot * reports.share_each
+        blocks = max(1.0 - reports.share_reserved, 0.0) / each
+        return int(whole_devices(load * min(blocks, carried.transmissions_per_slot)))
 
-    @property
-    def _slot_uses(self) -> float:
-        return self.cell.bandwidth_hz * self.cell.slot_s
+    def _carried(self, scheduler: str, payload_bits: int, snr_db: float) -> Carried:
+        granted = None if SCHEDULERS[scheduler].in_turn else True
+        return self.cell.phy.carries(payload_bits, snr_db, dynamic=granted)

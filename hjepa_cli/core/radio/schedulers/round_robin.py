@@ -8,5 +8,6 @@ from hjepa_cli.core.style import Style
 ROUND_ROBIN = Scheduler(
     "round-robin",
     lambda view: view.waited.astype(np.float64),
+    in_turn=True,
     style=Style("#7F7F7F", "s", ":", hollow=True),
 )

@@ -54,12 +54,14 @@ class Scheduler:
         name: as in ``--scheduler``.
         score: a slot → scores [N]; a device whose score is not above 0 gets no block.
         wants_reports: devices compare the controller's force with their own and report.
+        in_turn: the order is always the same, so that it can be agreed in advance.
         style: its line in figures.
     """
 
     name: str
     score: Callable[[SlotView], Floats]
     wants_reports: bool = False
+    in_turn: bool = False
     style: Style = PLAIN
 
     def __post_init__(self) -> None:

@@ -1,0 +1,114 @@
+"""CSV files have a row per picture; columns are named in their first line."""
+
+import csv
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hjepa_cli.core.arrays import Floats
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
+
+TIMES = ("time_s", "timestamp", "time")
+EPISODE, PICTURE = "episode", ("frame", "file", "image", "picture")
+BEGINNINGS = {"actions": "action", "states": "state", "expert": "expert"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Chosen:
+    """These columns were named by a person; ``None`` goes by how they begin."""
+
+    actions: tuple[str, ...] | None = None
+    states: tuple[str, ...] | None = None
+    expert: tuple[str, ...] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A CSV file as text, with the names of its columns by what they hold."""
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+    groups: dict[str, list[str]]
+
+    @property
+    def picture(self) -> str | None:
+        """Return the column that names picture files, if there is one."""
+        return next((name for name in PICTURE if name in self.header), None)
+
+    @property
+    def time(self) -> str | None:
+        """Return the column of times in seconds, if there is one."""
+        return next((name for name in TIMES if name in self.header), None)
+
+    def episodes(self) -> dict[str, list[int]]:
+        """Return the rows of each episode by its name, in order; all of one without a column."""
+        if EPISODE not in self.header:
+            return {"": list(range(len(self.rows)))}
+        place, found = self.header.index(EPISODE), dict[str, list[int]]()
+        for number, row in enumerate(self.rows):
+            found.setdefault(row[place], []).append(number)
+        return found
+
+    def texts(self, column: str, rows: Sequence[int]) -> list[str]:
+        """Return a column as it is written."""
+        place = self.header.index(column)
+        return [self.rows[row][place] for row in rows]
+
+    def numbers(self, columns: Sequence[str], rows: Sequence[int]) -> Floats:
+        """Return columns as float64 [rows, columns]; empty places are NaN.
+
+        Raises:
+            DataError: something is no number; it names the line.
+        """
+        values = np.empty((len(rows), len(columns)))
+        for at, column in enumerate(columns):
+            for place, text in enumerate(self.texts(column, rows)):
+                try:
+                    values[place, at] = float(text) if text.strip() else math.nan
+                except ValueError:
+                    line = rows[place] + 2
+                    raise DataError(
+                        f"{self.path}, line {line}: {column} = {text!r} is no number"
+                    ) from None
+        return values
+
+
+def read(path: Path, chosen: Chosen) -> Table:
+    """Read a CSV file.
+
+    Raises:
+        MissingInputError: there is none.
+        UsageError: a column that was named is not in it.
+        DataError: it is none, a line has another number of columns, or no column is an action's.
+    """
+    try:
+        with open(path, encoding="utf-8-sig", newline="") as file:
+            header, *rows = csv.reader(file, strict=True)
+    except FileNotFoundError:
+        raise MissingInputError(f"{path} does not exist") from None
+    except (OSError, ValueError, csv.Error) as error:
+        raise DataError(f"{path} is no CSV file with a header: {error}") from None
+    header = [name.strip() for name in header]
+    for number, row in enumerate(rows, start=2):
+        if len(row) != len(header):
+            raise DataError(
+                f"{path}, line {number}: {len(row)} columns; the header has {len(header)}"
+            )
+    groups = {}
+    for key, beginning in BEGINNINGS.items():
+        named = getattr(chosen, key)
+        for name in named or ():
+            if name not in header:
+                raise UsageError(f"{path} has no column '{name}'; it has {', '.join(header)}")
+        found = [name for name in header if name.lower().startswith(beginning)]
+        groups[key] = list(named) if named is not None else found
+    if not groups["actions"]:
+        raise DataError(
+            f"{path} has no column whose name begins with action; it has {', '.join(header)}",
+            hint="--actions A,B names the columns of actions",
+        )
+    return Table(path, header, rows, groups)
