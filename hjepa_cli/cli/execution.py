@@ -42,7 +42,8 @@ def execute(command: Command, given: Given) -> None:
             parameters = inspect.signature(plan).parameters
             takes_all = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
             wanted = [name for name in inputs if name in parameters or takes_all]
-            planned = plan(**{name: inputs[name] for name in wanted if name != "screen"})
+            wanted = [name for name in wanted if name != "screen" or name in parameters]
+            planned = plan(**{name: inputs[name] for name in wanted})
             if not isinstance(planned, Plan):
                 raise UsageError(f"{command.name} planned {planned!r}; expected a Plan")
             memory.check(planned.memory_bytes, command.name)

@@ -292,7 +292,7 @@ _IMPORT = {
         "Columns of what an expert would do. Without it: those called expert…, else the actions.",
         "A,B",
     ),
-    "camera:import": Input(str, "--camera", "Which camera of a LeRobotDataset.", "NAME"),
+    "camera": Input(str, "--camera", "Which camera of a LeRobotDataset.", "NAME"),
     "skip_bad": _switch("--skip-bad", "Leave unsound episodes out, and list them."),
 }
 _LOOP = {
@@ -424,7 +424,7 @@ _WIRE = {
         "--number",
         "The device's own number; without it a random one.",
     ),
-    "camera": Input(
+    "camera:wire": Input(
         str,
         "--camera",
         "sim, a camera's number, a directory of pictures, or a video file.",

@@ -77,7 +77,7 @@ def run(
     screen: Screen,
     *,
     out: Path | None = None,
-    model: Path,
+    model: Path = Path("exported"),
     devices: int = 64,
     steps: int = 1000,
     lockstep: bool = False,
@@ -208,7 +208,20 @@ def run(
 
 
 def plan(
-    settings: Settings, *, out: Path | None = None, model: Path, devices: int, steps: int, **_: Any
+    settings: Settings,
+    *,
+    out: Path | None = None,
+    model: Path = Path("exported"),
+    devices: int = 64,
+    steps: int = 1000,
+    lockstep: bool = False,
+    period_ms: float | None = None,
+    gap_steps: int = 80,
+    delivery: float | None = None,
+    trace: Path | None = None,
+    harm: str | None = None,
+    checkpoint: str | None = None,
+    backend: str = "onnxruntime",
 ) -> Plan:
     """Plan a drive; arguments as of :func:`run`."""
     bundle = open_bundle(model)

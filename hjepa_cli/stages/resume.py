@@ -112,7 +112,7 @@ def recall(directory: Path, screen: Screen) -> tuple[Stage, Settings, dict[str, 
             raise
         raise UsageError(
             f"{directory} was made by hjepa {made_by}, this is {__version__}: {error.message}",
-            hint=f"take it up with hjepa {made_by}; or anew: {anew(found)} --out DIR",
+            hint=f"take it up with that version; or anew: {anew(found)} --out DIR",
         ) from None
     if made_by != __version__:
         screen.say(f"begun by hjepa {made_by}, this is {__version__}: results may differ")

@@ -264,9 +264,8 @@ def examine(
 def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any]]:
     """Compare the health report with the stage's gates; return value and verdict by gate."""
     options, states = settings.encoder, plant_of(settings).state_names
-    bounds = {}
+    bounds, of_recorded = {}, settings.plant == RECORDED
     if options.method == "jepa":  # a baseline is there to act, and nothing else
-        of_recorded = settings.plant == RECORDED
         # Of recordings nobody can say beforehand how well which state should be seen.
         least_r2 = options.gate_r2 if of_recorded else options.least_r2
         least = zip(states, least_r2, strict=False)
@@ -286,5 +285,5 @@ def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any
     return {
         name: {"value": values[name], "threshold": bound, "passed": passed(name, bound)}
         for name, bound in bounds.items()
-        if values[name] is not None
+        if values[name] is not None or not of_recorded
     }

@@ -351,7 +351,7 @@ def test_flag_without_its_value(shell):
         ("[collect]\nx_m = -0.1\n", 2, "collect.x_m"),
         ("seed = -1\n", 2, "seed"),
         ("[actor]\ndropout = 1.0\n", 2, "actor.dropout"),
-        ("[collect]\nsteps = 1\n", 2, "expected a whole number of at least 2"),
+        ("[collect]\nsteps = 1\n", 2, "expected a whole number from 2 to 1000000000"),
         ("[encoder]\nbatch_frames = 1\n", 2, "encoder.batch_frames = 1 in c.toml, line 2"),
         ("[encoder]\nembedding = 7\n", 2, "embedding = 7 in c.toml, line 2; expected an even"),
         ("[encoder]\nembedding = 1\n", 2, "embedding = 1 in c.toml, line 2; expected an even"),

@@ -43,7 +43,7 @@ def completed(*words: str) -> list[str]:
     [
         (["train-encoder", "--dataset", "da"], ["data/desktop-0001"]),
         (["resume", "runs/e"], ["runs/eval/0002"]),
-        (["eval", "--methods", "hjepa,ora"], ["hjepa,oracle"]),
+        (["eval", "--methods", "hjepa,oracle-"], ["hjepa,oracle-teacher"]),
         (["scale", "--scheduler", "max-aoi,whi"], ["max-aoi,whittle"]),
         (["scale", "--payload", "int1"], [f"int{n}" for n in range(10, 17)]),
         (["report", "runs/eval/"], ["runs/eval/0001"]),

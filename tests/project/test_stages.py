@@ -45,7 +45,7 @@ def test_listing_stages_imports_nothing_heavy():
     )
     pipeline = (
         "tune-law collect train-encoder train-hierarchy train-reflex train-fusion eval scale "
-        "survive reproduce"
+        "survive reproduce bench-link"
     )
     assert (done.returncode, done.stdout) == (0, f"{pipeline}\n"), done.stderr
 

@@ -117,7 +117,7 @@ def write_npz(
         for name, array in arrays.items():
             put(name, iter([array]), array.shape)
         if pixels is not None:
-            put("pixels", pixels, (len(values["action"]), *frame_shape))
+            put("pixels", pixels, (len(next(iter(values.values()))), *frame_shape))
 
 
 def blocks(split: Trajectories, frames: Frames, tick: Callable[[int], None]) -> Iterator[Any]:
