@@ -114,7 +114,10 @@ CLASSES = {  # what extensions are made with, those with families too
 
 NAME = re.compile(r"\w[\w.-]{0,63}")  # goes into flags, lists between commas and paths
 TAKEN = {  # names that mean something else where such a name may stand
-    "stage": ("resume", "view", "report", "compare", "data", "models", "config"),
+    "stage": (
+        *("resume", "view", "report", "compare", "data", "models", "config"),
+        *("export", "serve", "device", "link"),
+    ),
     "plant": ("default", "paper", "smoke"),
 }
 

@@ -9,6 +9,7 @@ keep up.
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import select
 import signal
@@ -23,6 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hjepa_cli.compute import memory
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.controllers import StrideController
@@ -30,12 +32,13 @@ from hjepa_cli.core.control.drivers import planner_of
 from hjepa_cli.core.control.loop import Draws, LinkDraws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.core.statistics import bootstrap_weights, mean_interval
 from hjepa_cli.errors import NumericalError, Unavailable
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages import results
 from hjepa_cli.stages.device import check_plant
 from hjepa_cli.stages.export import checkpoint_of
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -106,9 +109,11 @@ def run(
         NumericalError: more than 0.1 % of steps had no force in time.
         Unavailable: the server does not start.
         DataError, MissingInputError: no such model, or of another plant.
+        OutOfMemory: what is measured of so many devices and steps does not fit.
     """
     bundle, kind = open_bundle(model), plant_of(settings)
     check_plant(bundle, settings)
+    memory.check(memory_bytes(kind, bundle, devices, steps), f"{devices} devices, {steps} steps")
     path = zoo.resolve_model(checkpoint) if checkpoint else checkpoint_of(bundle)
     flags = {
         "devices": devices,
@@ -127,6 +132,9 @@ def run(
     }
     with Run.create("bench-link", out, settings.as_dict(), {**inputs, **flags}) as record:
         if record.result is not None:
+            screen.say(f"{record.directory} is finished; this is its result")
+            with results.showing("bench-link", record.result, record.directory):
+                show(screen, record.result)
             return record.result
         torch.set_num_threads(1)
         protocol_ = dataclasses.replace(settings.protocol, warmup_steps=0, steps=steps)
@@ -225,7 +233,14 @@ def plan(
         writes=[run_directory("bench-link", out)],
         writes_bytes=20_000,
         seconds=10 + steps * PERIOD_MS / 1e3 + devices * steps / 20_000,
+        memory_bytes=memory_bytes(plant_of(settings), bundle, devices, steps),
     )
+
+
+def memory_bytes(kind: System, bundle: Bundle, devices: int, steps: int) -> float:
+    """Return what draws, states of both loops, schedules and one picture of each device take."""
+    values = 3 * len(kind.state_names) + 1
+    return devices * (steps * (8 * values + 3) + bundle.frames * math.prod(FRAME_SHAPE))
 
 
 def compared(

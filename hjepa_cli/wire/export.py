@@ -34,7 +34,7 @@ from hjepa_cli.core.networks.hierarchy import hold, plan_stride
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of
-from hjepa_cli.core.plants.named import camera_in, plant
+from hjepa_cli.core.plants.named import camera_in
 from hjepa_cli.core.plants.recorded import Recorded
 from hjepa_cli.errors import DataError, NumericalError, UsageError, choices, require, shell
 from hjepa_cli.plugins import METHODS
@@ -142,8 +142,16 @@ def exported_method(model: Model, method: str | None) -> str:
     """Return the method to export: the one asked for, or the first that plans in strides.
 
     Raises:
-        UsageError: the model does not plan with it, or with any.
+        UsageError: the model does not plan with it, or with any; or it is of a recorded plant, or
+            of frames of another size.
     """
+    shape = camera_in(model.architecture).frame_shape
+    if isinstance(model.plant, Recorded) or shape != FRAME_SHAPE:
+        raise UsageError(
+            f"a model of plant {model.plant_name} and frames {shape} cannot be exported; the wire "
+            f"carries plants that can be simulated, seen in frames {FRAME_SHAPE}",
+            hint="hjepa models list",
+        )
     able = [
         name
         for name in methods_of(model)
@@ -219,7 +227,7 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, f"export needs {module}", "export")
     method = exported_method(model, method)
-    kind, entries = plant(model.plant_name), dict[str, Any]()
+    kind, entries = model.plant, dict[str, Any]()
     files.make_directory(directory)
     files.refuse_foreign(directory, "exported model", OURS.__contains__)
     with files.writing(directory):
@@ -239,7 +247,7 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
         "embedding": model.architecture["embedding"],
         "frames": model.frames,
         "frame_shape": list(FRAME_SHAPE),
-        "camera": kind.camera().manifest(),
+        "camera": model.camera.manifest(),
         "action_shape": list(model.action_shape),
         "force_limit_n": model.force_limit_n,
         "stride": planner_of(model, method).stride,
@@ -373,7 +381,7 @@ def pictures(model: Model, split: str, count: int) -> Pixels:
     windows = np.stack([states[:, end - model.frames : end] for end in ends], axis=1)
     flat = windows.reshape(-1, *windows.shape[2:])
     chosen = np.random.default_rng(0).permutation(len(flat))[:count]
-    return frames_of(plant(model.plant_name).camera(), flat[chosen])
+    return frames_of(model.camera, flat[chosen])
 
 
 _SIZES = {"train": "trajectories", "clean": "clean_trajectories"}

@@ -705,3 +705,16 @@ def test_document_has_no_nan_even_from_numpy(shell, stage):
     stage.result = {"methods": {"hold": {"nmae": np.array([0.5, np.nan])}}}
     assert shell("eval", "--json").document == {"methods": {"hold": {"nmae": [0.5, None]}}}
     assert json.loads(shell("eval", "--json").out)
+
+
+def test_no_two_inputs_have_one_name() -> None:
+    """Tables of inputs become one: the later of two alike would take the place of the other."""
+    from hjepa_cli.cli import flags
+
+    tables = [
+        table
+        for name, table in vars(flags).items()
+        if isinstance(table, dict) and name != "INPUTS"
+        if table and all(isinstance(one, flags.Input) for one in table.values())
+    ]
+    assert sum(map(len, tables)) == len(flags.INPUTS) > 100

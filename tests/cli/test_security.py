@@ -23,11 +23,21 @@ METHODS = {
     *("subprocess.run", "subprocess.Popen", "subprocess.call", "subprocess.check_output"),
 }
 
+SOCKETS = (
+    *("socket", "socket.socket", "socket.AddressFamily", "socket.getaddrinfo"),
+    *("socket.SOCK_DGRAM", "socket.SOL_SOCKET", "socket.SO_RCVBUF", "socket.SO_SNDBUF"),
+)
 # Reviewed: public names come from a table in the same file; ffmpeg gets a list of arguments.
 ALLOWED = {
     "hjepa_cli/__init__.py": ("importlib.import_module",),
     "hjepa_cli/cli/execution.py": ("importlib.import_module",),  # stages, by the list of commands
     "hjepa_cli/output/animation.py": ("subprocess.Popen",),
+    # Datagrams go to and come from whom the user has named, and are parsed byte by byte.
+    "hjepa_cli/wire/bench.py": ("socket.recvfrom", "socket.sendto"),
+    "hjepa_cli/wire/drive.py": ("socket", "socket.socket"),
+    "hjepa_cli/wire/relay.py": SOCKETS,
+    "hjepa_cli/wire/server.py": SOCKETS,
+    "hjepa_cli/stages/bench_link.py": ("subprocess.Popen",),  # this program itself, as serve
     "hjepa_cli/stages/stage.py": ("importlib.import_module",),  # places in the package's own code
     # The package's own extensions by a table; a file that the user names on the command line.
     "hjepa_cli/plugins.py": ("importlib.import_module", "exec()", "compile()"),

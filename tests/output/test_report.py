@@ -365,6 +365,58 @@ def test_a_run_of_reflexes_has_its_section(shell, without_figures):
         assert part in text, part
 
 
+def test_a_run_of_fusion_has_its_section(shell, without_figures):
+    distances = {"predicted": 0.02, "packets": 0.11, "corrected": 0.00731}
+    document = {"checkpoint": "f/model.safetensors", "seconds": 90.0, "packets": 4321}
+    made = finished("train-fusion", document | {"distances": distances})
+    assert shell("report", made, "--json").code == 0
+    text = (shell.directory / "report.html").read_text()
+    for part in ("Posterior, f/model.safetensors", "4321 packets", "0.11000", "0.00731"):
+        assert part in text, part
+
+
+WIRE = {
+    "model": "exported",
+    "method": "hjepa",
+    "plant": "desktop",
+    "seed": 3,
+    "devices": 2,
+    "steps": 20,
+    "lockstep": False,
+    "period_ms": 7.5,
+    "n_devices": 2,
+    "n_steps": 20,
+    "score_link": 0.81,
+    "score_link_ci95": [0.8, 0.82],
+    "score_simulated": 0.82,
+    "score_simulated_ci95": [0.81, 0.83],
+    "score_difference": -0.01234,
+    "score_difference_ci95": [-0.02, 0.01],
+    "missing_share": 0.0,
+    "late_answers_share": 0.5,
+    "ages": {"0": 3, "2": 3},
+    "sources": {"planned": 40, "held": 0},
+    "skipped_strides": 77,
+    "theta_difference_rad": {"20": 1e-6},
+}
+
+
+def test_a_run_over_the_wire_has_its_section(shell):
+    assert shell("report", finished("bench-link", WIRE), "--json").code == 0
+    text = (shell.directory / "report.html").read_text()
+    for part in ("7.5 ms a step", "-0.0123", "77", "in 20 steps"):
+        assert part in text, part
+    assert text.count("<img") == 1
+
+
+@pytest.mark.parametrize(
+    "change", [{"ages": {"0": "many"}}, {"score_link": None}, {"period_ms": "slow"}]
+)
+def test_a_damaged_run_over_the_wire_is_refused(shell, change):
+    made = finished("bench-link", WIRE | change)
+    assert_one_line_error(shell("report", made), 65, "lacks what a bench-link run has")
+
+
 def test_runs_that_no_report_shows_are_refused(shell):
     made = finished("collect", {"dataset": "d"})
     assert_one_line_error(shell("report", made), 66, "no run of train-encoder")

@@ -74,6 +74,9 @@ def test_mistakes_with_a_model(shell, model, tmp_path):
         shell, 2, "device", "--model", model, "--camera", "nonsense", says=["--camera nonsense"]
     )
     refused(shell, 2, "device", "--model", model, "--actuator", "wheel", says=["--actuator wheel"])
+    many = ("bench-link", "--model", model, "--lockstep", "--steps", "1000000000")
+    refused(shell, 70, *many, says=["GB of memory"])
+    refused(shell, 70, *many, "--dry-run", says=["GB of memory"])
     (tmp_path / "wide").mkdir()
     pillow = pytest.importorskip("PIL.Image")
     pillow.new("RGB", (640, 480)).save(tmp_path / "wide" / "0.png")

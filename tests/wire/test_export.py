@@ -145,6 +145,39 @@ def test_models_that_plan_nothing_and_other_directories_are_refused(tmp_path):
         export(zoo.resolve_model("desktop-h4m2l1"), tmp_path, None)
 
 
+def test_a_model_that_corrects_by_packets_is_exported_without_that():
+    """A bundle has no posterior: as ``hjepa-fused`` it would drive as another method."""
+    from hjepa_cli.core.control import drivers
+    from hjepa_cli.storage import zoo
+    from hjepa_cli.wire import export
+
+    model = export.load_fp32(zoo.resolve_model("desktop-h4m2l1"))
+    model.architecture["fusion"] = True
+    assert "hjepa-fused" in drivers.methods_of(model)
+    assert export.exported_method(model, None) == "hjepa"
+    with pytest.raises(UsageError, match="cannot be exported as 'hjepa-fused'"):
+        export.exported_method(model, "hjepa-fused")
+
+
+def test_models_of_other_pictures_are_refused(tmp_path):
+    """Cameras, doors and calibration of the wire know pictures of one size, and plants to draw."""
+    import dataclasses
+
+    from hjepa_cli.config.schema import CameraSettings
+    from hjepa_cli.core.plants.recorded import UNKNOWN
+    from hjepa_cli.storage import zoo
+    from hjepa_cli.wire import export
+
+    small = dataclasses.asdict(CameraSettings(height_px=32, width_px=64))
+    for change in ({"architecture": {"camera": small}}, {"plant": UNKNOWN}):
+        model = export.load_fp32(zoo.resolve_model("desktop-h4m2l1"))
+        for name, value in change.items():
+            old = getattr(model, name)
+            setattr(model, name, old | value if isinstance(value, dict) else value)
+        with pytest.raises(UsageError, match="cannot be exported; the wire"):
+            export.exported_method(model, None)
+
+
 def test_lockstep_is_the_simulator(exported):
     """Two loops with the same networks: over the wire and in the simulator, lost downlinks too.
 
