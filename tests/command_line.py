@@ -102,7 +102,7 @@ def commands_in(hint: str) -> Iterator[list[str]]:
     ends = r"(?=[,;)] |[,;)]?$| (?:shows|continues|goes on|where|with|or|and|in) )"
     for found in re.finditer(rf"(?:^|[ :(])hjepa (\S.*?){ends}", hint):
         words = shlex.split(found[1])
-        if not {"...", "…"} & {*words}:
+        if not {"...", "…"} & {*words} and not words[0][0].isdigit():  # a version is no command
             yield [f"{word.lower()}.x" if word.isupper() else word for word in words]
 
 

@@ -60,10 +60,10 @@ def test_commands_in_hints_are_what_a_shell_takes_back() -> None:
         assert printed == os.fsencode(word) and shell([word]).isprintable()
 
 
-@pytest.mark.parametrize("words", [["models", "info", "é"], ["collect", "--out", "é", "--quiet"]])
+@pytest.mark.parametrize("words", [["models", "info", "é"], ["eval", "--out", "é", "--quiet"]])
 def test_a_locale_of_few_characters_is_enough(tmp_path: Path, words: list[str]) -> None:
     poor = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    small = ["--preset", "smoke", "--trajectories", "2"] if "collect" in words else []
+    small = ["--preset", "smoke", "--methods", "oracle"] if "eval" in words else []
     done = subprocess.run(
         [sys.executable, "-m", "hjepa_cli", *words, *small],
         cwd=tmp_path,
@@ -73,8 +73,8 @@ def test_a_locale_of_few_characters_is_enough(tmp_path: Path, words: list[str]) 
     )
     assert done.returncode == (66 if "info" in words else 0), done
     assert b"Traceback" not in done.stderr and b"unexpected" not in done.stderr
-    if "collect" in words:
-        assert (tmp_path / "é" / "dataset.json").exists()
+    if "eval" in words:  # whose result names its files
+        assert (tmp_path / "é" / "result.json").exists()
 
 
 def test_json_keeps_bytes_of_paths_and_no_other_broken_text(tmp_path: Path) -> None:
