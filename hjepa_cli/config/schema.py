@@ -97,6 +97,8 @@ class EncoderSettings:
     hidden: Count = 1024
     h: Annotated[Count, STRIDE_H] = 4
     frame_input: Literal["difference", "pair"] = "difference"
+    # Each frame is fitted to its background: not, by a gain, or by gain and offset.
+    photometric: Literal["none", "gain", "affine"] = "none"
     stride_actions: Literal["all", "held"] = "all"
     residual: bool = True
     centre: bool = True
@@ -276,7 +278,12 @@ class ProtocolSettings:
         return self.noise or (0.0, self.noise_x_dot_m_s, 0.0, self.noise_theta_dot_rad_s)
 
 
-IDEAL_LINK = ("delay_steps", "jitter_steps", "downlink_loss")  # all 0 in the paper
+# Where these are so, nothing is stored of them: all else says the same as before there were such
+# settings, and so do digests.
+UNSAID = {
+    **dict.fromkeys(("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss"), 0),
+    "encoder.photometric": "none",
+}
 
 # What --protocol paper sets over these: scored from the start on.
 PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
@@ -443,16 +450,17 @@ class Settings:
     conditions: ConditionSettings = ConditionSettings()
     radio: RadioSettings = RadioSettings()
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self, *, complete: bool = False) -> dict[str, Any]:
         """Return nested plain data, ready for JSON (tuples become lists).
 
-        Empty lists and the zeros of an ideal link are left out: they stand for values that say the
-        same, and digests of settings stay what they were before there were such settings.
+        Empty lists are left out, and unless it shall be ``complete`` what is off: they stand for
+        values that say the same, and digests of settings stay what they were before there were
+        such settings.
         """
         values = _without_empty(plain(dataclasses.asdict(self)))
-        for key in IDEAL_LINK:
-            if not values["protocol"][key]:
-                del values["protocol"][key]
+        for section, name in (key.split(".") for key in UNSAID):
+            if not complete and values[section][name] == UNSAID[f"{section}.{name}"]:
+                del values[section][name]
         if not values["control"]:
             del values["control"]
         return values

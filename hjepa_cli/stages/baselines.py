@@ -19,7 +19,7 @@ from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
-from hjepa_cli.stages.frame_training import fit
+from hjepa_cli.stages.frame_training import fit, recorded
 from hjepa_cli.stages.inputs import embed
 from hjepa_cli.stages.training import TrainingRun
 
@@ -30,10 +30,9 @@ LOOK_FRAMES = 500  # of them, for the reconstruction error
 def describe_architecture(settings: Settings) -> dict[str, Any]:
     """Return the architecture of a baseline, as it goes into the checkpoint."""
     encoder, actor = settings.encoder, settings.actor
-    recorded = ("frames", "embedding", "frame_input", "centre", "mirror")
     return {
         "kind": encoder.method,
-        **{name: getattr(encoder, name) for name in recorded},
+        **recorded(encoder, "frames", "embedding", "frame_input", "centre", "mirror"),
         "actor_hidden": actor.hidden,
         "actor_dropout": actor.dropout,
     }

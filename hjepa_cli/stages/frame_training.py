@@ -6,6 +6,8 @@ from typing import Any
 from torch import Tensor
 
 from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.schema import EncoderSettings
+from hjepa_cli.core.networks.model import UNSAID
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.batches import FrameWindows
@@ -16,6 +18,12 @@ from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
 from hjepa_cli.stages.training import Drawn, TrainingRun
 
 STREAM = 2  # this stage's branch of the seed tree
+
+
+def recorded(encoder: EncoderSettings, *names: str) -> dict[str, Any]:
+    """Return the settings that an architecture records: those named, and others unless usual."""
+    values = {name: getattr(encoder, name) for name in (*names, *UNSAID)}
+    return {name: v for name, v in values.items() if name in names or v != UNSAID[name]}
 
 
 def fit(

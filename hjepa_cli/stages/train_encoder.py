@@ -28,7 +28,7 @@ from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_gates
 from hjepa_cli.stages import baselines
-from hjepa_cli.stages.frame_training import fit
+from hjepa_cli.stages.frame_training import fit, recorded
 from hjepa_cli.stages.inputs import count_frames, embed, open_dataset
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
@@ -154,9 +154,9 @@ def describe_architecture(settings: Settings) -> dict[str, Any]:
     encoder = settings.encoder
     if encoder.method != "jepa":
         return baselines.describe_architecture(settings)
-    recorded = {name: getattr(encoder, name) for name in ARCHITECTURE}
+    of_encoder = recorded(encoder, *ARCHITECTURE)
     # One level: the companion.
-    return {"kind": "encoder", **recorded, "h": encoder.h, "m": encoder.h, "l": encoder.h}
+    return {"kind": "encoder", **of_encoder, "h": encoder.h, "m": encoder.h, "l": encoder.h}
 
 
 def train_jepa(

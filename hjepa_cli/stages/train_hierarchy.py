@@ -179,7 +179,8 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
             config = read_config(run)
             encoder = config["encoder"]
             is_jepa = encoder.get("method", "jepa") == "jepa"
-            alike = all(encoder[key] == wanted[key] for key in train_encoder.ARCHITECTURE)
+            keys = (*train_encoder.ARCHITECTURE, "frames", "photometric")
+            alike = all(encoder.get(key) == wanted.get(key) for key in keys)
             return is_jepa and alike and config["plant"] == settings.plant
 
         name = newest_run("train-encoder", fits) or find_model(settings.plant)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils import fuse_conv_bn_eval
 
+from hjepa_cli.core.networks.photometry import against_background
 from hjepa_cli.core.networks.symmetry import (
     MirrorCentre,
     MirrorConv2d,
@@ -83,6 +84,8 @@ class Encoder(nn.Module):
         symmetric: whether the embedding of a mirrored picture is the reflected embedding; D is
             even then, and the offset is on the even half.
         frames: κ, the current one and κ − 1 earlier ones.
+        photometric: whether every frame is fitted to its background first, and by what; see
+            :func:`~hjepa_cli.core.networks.photometry.against_background`.
     """
 
     input_mean: Tensor
@@ -96,9 +99,11 @@ class Encoder(nn.Module):
         centre: bool,
         symmetric: bool = False,
         frames: int = 2,
+        photometric: str = "none",
     ) -> None:
         super().__init__()
         self.embedding, self.frame_input, self.symmetric = embedding, frame_input, symmetric
+        self.photometric = photometric
         channels = frames * CHANNELS
         self.register_buffer("input_mean", torch.zeros(channels))
         self.register_buffer("input_std", torch.ones(channels))
@@ -176,14 +181,20 @@ class Encoder(nn.Module):
     def inputs(self, frames: Tensor) -> Tensor:
         """Return what the network sees of frames [N, κ, 64, 128, 3], the present first.
 
-        It is [N, 3κ, 64, 128] in bfloat16: pixels and their differences are exact in it.
+        It is [N, 3κ, 64, 128] in bfloat16: pixels and their differences are exact in it. Pixels
+        that are fitted to their background are rounded there, but their differences before that.
         """
-        seen = [frame.bfloat16() for frame in reversed(frames.unbind(1))]
+        if self.photometric == "none":
+            seen = [frame.bfloat16() for frame in reversed(frames.unbind(1))]
+        else:
+            fitted = against_background(frames.flatten(0, 1), self.photometric)
+            seen = [*reversed(fitted.unflatten(0, frames.shape[:2]).unbind(1))]
         earlier = seen[1:]
         if self.frame_input == "difference":
             earlier = [later - before for later, before in pairwise(seen)]
         # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.
-        return torch.cat([seen[0], *earlier], dim=-1).permute(0, 3, 1, 2)
+        together = [part.bfloat16() for part in (seen[0], *earlier)]
+        return torch.cat(together, dim=-1).permute(0, 3, 1, 2)
 
 
 def _fold(module: nn.Module, convolution: str, norm: str) -> None:

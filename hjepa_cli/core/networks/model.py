@@ -19,6 +19,7 @@ from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
+from hjepa_cli.core.networks.photometry import FITS
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import same_camera
@@ -35,7 +36,9 @@ CHOICES = {  # of an architecture; its other values are sizes
     "centre": (True, False),
     "residual": (True, False),
     "mirror": ("exact", "augment", "none"),
+    "photometric": FITS,
 }
+UNSAID = {"frames": 2, "photometric": "none"}  # of an encoder, where its architecture has no such
 PRECISIONS = ("auto", "bf16", "fp32")
 LEVELS = {  # of each kind that has some, in the order of the checkpoint
     "encoder": ("high",),
@@ -68,13 +71,15 @@ def build_modules(
     if kind not in KINDS:
         built: nn.ModuleDict = _extended(kind).modules(architecture, action_shape, force_signs)
         return built
-    embedding, frames = architecture["embedding"], architecture.get("frames", 2)
+    architecture = UNSAID | architecture
+    embedding, frames = architecture["embedding"], architecture["frames"]
     symmetric = architecture["mirror"] == "exact"
     mirror = force_signs if symmetric else None
 
     def encoder() -> Encoder:
         frame_input, centre = architecture["frame_input"], architecture["centre"]
-        return Encoder(embedding, frame_input, centre, symmetric, frames)
+        photometric = architecture["photometric"]
+        return Encoder(embedding, frame_input, centre, symmetric, frames, photometric)
 
     def actor() -> Actor:
         hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
@@ -261,7 +266,7 @@ class Model:
         self.precision: str = metadata["settings"]["encoder"]["precision"]
         kind = plant(self.plant_name)
         self.force_limit_n, self.action_shape = kind.force_limit_n, kind.action_shape
-        self.frames: int = self.architecture.get("frames", 2)
+        self.frames: int = self.architecture.get("frames", UNSAID["frames"])
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
         is_reflex = self.architecture["kind"] == "reflex"
