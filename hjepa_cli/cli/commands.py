@@ -32,6 +32,7 @@ LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss
 MEASURED = (
     *(*LOOP, "protocol.process_noise", "protocol.plant_spread", "protocol.payload"),
     *LINK,
+    "conditions.stress",
 )
 
 Given = dict[str, Any]  # what was given, by dotted key or argument; None: not given
@@ -89,7 +90,7 @@ def _one_level(given: Given) -> None:
 
 
 def _figure_of_all(given: Given) -> None:
-    if given["figure"] and given["methods"] is None:
+    if given["figure"] and given["methods"] is None and given["stress"] is None:
         given["methods"] = compared_methods()
 
 
@@ -173,7 +174,7 @@ COMMANDS = (
     staged(
         "eval",
         takes=(
-            *(*MEASURED, "remeasure", "figure", "checkpoint", "dataset:clean", "out"),
+            *(*MEASURED, "stress", "remeasure", "figure", "checkpoint", "dataset:clean", "out"),
             *(*COMPUTED, *PARALLEL),
         ),
         prepare=_figure_of_all,
@@ -194,7 +195,8 @@ COMMANDS = (
         Imported("hjepa_cli.stages.view:run"),
         (
             *("methods:view", "devices", "snr_db", "delivery", "gap_steps", "every", "fps", "live"),
-            *("radio.bandwidth_hz", *LINK, "checkpoint", "out:animation", *COMPUTED),
+            *("radio.bandwidth_hz", *LINK, "conditions.stress", "checkpoint", "out:animation"),
+            *COMPUTED,
         ),
         plan=Imported("hjepa_cli.stages.view:plan"),
         product="file",

@@ -32,7 +32,8 @@ from hjepa_cli.plugins import LAWS, METHODS, PLANTS, SCHEDULERS
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
 SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
 PANELS = {  # of help, by section
-    "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "radio": RADIO,
+    "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "conditions": LOOP,
+    "radio": RADIO,
     "": SETTINGS,
 }  # fmt: skip
 
@@ -330,7 +331,7 @@ def taken(name: str) -> Input:
     flag = flag_of(hint)
     assert flag is not None, f"{name} has no flag"
     offered = None if flag.metavar or name not in NAMES else lambda: list(NAMES[name])
-    panel = LOOP if name == "methods" else PANELS[name.rpartition(".")[0]]
+    panel = LOOP if name in ("methods", "stress") else PANELS[name.rpartition(".")[0]]
     return Input(hint, **vars(flag), complete=offered, panel=panel)
 
 

@@ -283,6 +283,7 @@ class ProtocolSettings:
 UNSAID = {
     **dict.fromkeys(("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss"), 0),
     "encoder.photometric": "none",
+    "conditions.stress": "",
 }
 
 # What --protocol paper sets over these: scored from the start on.
@@ -326,6 +327,15 @@ class ConditionSettings:
     light: Positive = 1.0  # factor on what the camera sees
     camera_noise: NotNegative = 0.0  # standard deviation in every pixel, of 255
     pole_length: Positive = 1.0  # ÷ the nominal one
+    stress: Annotated[
+        str,
+        Flag(
+            "--condition",
+            "Conditions of devices and pictures that no model was trained for, as "
+            "light=0.7+noise=8; hjepa eval --stress tells their names.",
+            "NAME=VALUE+…",
+        ),
+    ] = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -439,6 +449,16 @@ class Settings:
         *("hjepa", "ts-jepa-1", "ts-jepa-4", "chunk", "hold-decay-linear"),
         *("hold", "optimal", "oracle"),
     )
+    stress: Annotated[
+        tuple[str, ...],
+        Flag(
+            "--stress",
+            "Measure, instead of curves, how scores hold under conditions: audit (a fixed set), "
+            "all, or names with or without a value, separated by commas, several joined by +: "
+            "light,noise=8,light=0.7+noise=8.",
+            "A,B|audit|all",
+        ),
+    ] = ()
     control: ControlSettings = ControlSettings()
     tune: TuneSettings = TuneSettings()
     collect: CollectSettings = CollectSettings()

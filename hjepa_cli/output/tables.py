@@ -4,7 +4,7 @@ from typing import Any
 
 from hjepa_cli.core.control.force_error import WINDOWS
 from hjepa_cli.core.evaluation.protocol import BESIDE
-from hjepa_cli.output.screen import Screen, described_steps, tolerance
+from hjepa_cli.output.screen import Screen, described_steps, span, tolerance
 
 
 def show_gates(screen: Screen, gates: dict[str, dict[str, Any]], *, enforced: bool) -> None:
@@ -99,6 +99,35 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
         if path != result["checkpoint"]:
             screen.say(f"{name} is of model {path}")
     screen.say(result["source"])
+
+
+def show_stress(result: dict[str, Any], screen: Screen) -> None:
+    """Print a table per method: scores under conditions, with their share of the nominal ones."""
+    stress = result["stress"]
+    gaps = stress["gaps"]
+    for name, entry in stress["methods"].items():
+        screen.table(
+            f"{result['plant']}, seed {result['seed']}: score of {name} by gap D between packets "
+            f"({stress['n_devices']} devices, {described_steps(stress)}, 95 % CI), and ÷ its "
+            "nominal score",
+            ["condition", *(f"D = {gap}" for gap in gaps), *(f"÷ nominal, {gap}" for gap in gaps)],
+            stress_rows(entry),
+        )
+
+
+def stress_rows(entry: dict[str, Any]) -> list[list[str | None]]:
+    """Return the rows of a method's table, the nominal first, the mean of the others last."""
+    rows = [("nominal", entry["nominal"])]
+    rows += [(row["condition"], row["points"]) for row in entry["rows"]]
+    rows += [("mean of these", entry["means"])] if len(entry["rows"]) > 1 else []
+    return [
+        [
+            name,
+            *(span(point["score"], point["ci95"], 2) for point in points),
+            *(_number(point["relative"], 2) for point in points),
+        ]
+        for name, points in rows
+    ]
 
 
 def _number(value: float | None, decimals: int) -> str | None:

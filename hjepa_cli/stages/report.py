@@ -18,6 +18,7 @@ from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
+from hjepa_cli.output.tables import stress_rows
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
@@ -119,7 +120,7 @@ def page_template() -> Template:
         "percent": percent,
         "sprintf": lambda value, text: text % value,
     }
-    named = (gates, in_order, ranked, span, tolerance, windows)
+    named = (gates, in_order, ranked, span, stress_rows, tolerance, windows)
     environment.globals |= {one.__name__: one for one in named} | {"version": __version__}
     return environment.get_template("report.html.j2")
 
@@ -243,6 +244,9 @@ def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path
     """Draw score against gap and delivery, error against the horizon; none that would be empty."""
     from hjepa_cli.output import figures
 
+    if "stress" in result:
+        caption = "Score ÷ nominal score against the severity of each condition, 95 % bands"
+        return {"stress": (caption, figures.stress_figure(result["stress"]))}
     entries = in_order(result["methods"], config["methods"])
     step_s = plant(result["plant"]).step_s
     acceptable = config["protocol"]["acceptable_score"]

@@ -188,7 +188,7 @@ class Encoder(nn.Module):
             seen = [frame.bfloat16() for frame in reversed(frames.unbind(1))]
         else:
             fitted = against_background(frames.flatten(0, 1), self.photometric)
-            seen = [*reversed(fitted.unflatten(0, frames.shape[:2]).unbind(1))]
+            seen = [*reversed(fitted.view(frames.shape).unbind(1))]
         earlier = seen[1:]
         if self.frame_input == "difference":
             earlier = [later - before for later, before in pairwise(seen)]

@@ -71,7 +71,7 @@ def build_modules(
     if kind not in KINDS:
         built: nn.ModuleDict = _extended(kind).modules(architecture, action_shape, force_signs)
         return built
-    architecture = UNSAID | architecture
+    architecture = {**UNSAID, **architecture}
     embedding, frames = architecture["embedding"], architecture["frames"]
     symmetric = architecture["mirror"] == "exact"
     mirror = force_signs if symmetric else None

@@ -37,7 +37,7 @@ def against_background(frames: Tensor, fit: str) -> Tensor:
         factor = WHITE / level.clamp_min(LEAST)
     else:
         half = pixels[:, ::2] - level.repeat(1, width)[:, None]
-        fourth = half.square_().square_().sum(1).unflatten(1, (width, -1)).sum(1)
+        fourth = half.square_().square_().sum(1).view(len(frames), width, -1).sum(1)
         spread = (fourth / (half.shape[1] * width)) ** 0.25
         factor = CONTRAST / spread.clamp_min(LEAST)
     # A row of pixels is one run in memory: factors along it cost least.
@@ -49,7 +49,7 @@ def _background(frames: Tensor) -> Tensor:
     """Return the level [N, C] of the background of frames [N, H, W, C]."""
     rows = frames.shape[1] // 9
     columns = torch.cat([frames[:, :, ::APART_PX], frames[:, :, APART_PX - 1 :: APART_PX]], 2)
-    bands = columns[:, : 9 * rows].unflatten(1, (3, 3, rows)).float().mean(3)
+    bands = columns[:, : 9 * rows].reshape(-1, 3, 3, rows, *columns.shape[2:]).float().mean(3)
     return _middle(_middle(bands)).median(1).values
 
 

@@ -24,15 +24,20 @@ def frames_seen(k: ArrayLike, frames: int) -> Integers:
 def frames_of(camera: Camera, states: ArrayLike, batch: int | None = None) -> Pixels:
     """Render states [N, …, S] into frames uint8 [N, …, 64, 128, 3].
 
-    ``batch`` of the N are rendered at a time, which bounds the memory; all by default.
+    ``batch`` of the N are rendered at a time, which bounds the memory; all by default. A camera
+    that has ``film`` is told which states [N, κ, S] belong to one packet.
 
     Raises:
         NumericalError: a state is not finite.
     """
     states = finite(states, "states")
     frames = np.empty((*states.shape[:-1], *FRAME_SHAPE), np.uint8)
+    film = getattr(camera, "film", None) if states.ndim == 3 else None
     for start in range(0, len(states), batch or max(len(states), 1)):
         part = slice(start, start + (batch or len(states)))
+        if film is not None:
+            frames[part] = film(states[part])
+            continue
         frames[part].reshape(-1, *FRAME_SHAPE)[:] = camera.render(
             states[part].reshape(-1, states.shape[-1])
         )
