@@ -145,6 +145,30 @@ class EncoderSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class AugmentSettings:
+    """Networks are trained on worse pictures, with the labels and targets of clean ones.
+
+    ``strength`` multiplies what follows it, each the most that a training picture gets; 0 is off.
+    """
+
+    strength: NotNegative = 0.0
+    share: Annotated[float, Meta(ge=0, le=1)] = 0.5  # of pictures, for each effect by itself
+    gain: BelowOne = 0.35  # ± of 1
+    gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
+    colour: BelowOne = 0.1  # ± of each channel
+    gradient: BelowOne = 0.25  # fall of light from edge to edge, in any direction
+    flicker: BelowOne = 0.02  # less light in a frame
+    shot_noise: NotNegative = 4.0  # standard deviation at white, of 255
+    read_noise: NotNegative = 10.0
+    blur_px: NotNegative = 1.75  # standard deviation
+    jitter_px: NotNegative = 0.12  # standard deviation, anew in every frame
+    rotation_deg: NotNegative = 2.5
+    rectangle_px: NotNegative = 16.0  # side, of any grey
+    # Of training pictures once more, with clean labels, for actor and predictors.
+    copies: CountOrNone = 2
+
+
+@dataclasses.dataclass(frozen=True)
 class ActorSettings:
     """Both training stages fit the semantic actor."""
 
@@ -463,6 +487,7 @@ class Settings:
     tune: TuneSettings = TuneSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
+    augment: AugmentSettings = AugmentSettings()
     actor: ActorSettings = ActorSettings()
     hierarchy: HierarchySettings = HierarchySettings()
     reflex: ReflexSettings = ReflexSettings()
@@ -478,6 +503,8 @@ class Settings:
         such settings.
         """
         values = _without_empty(plain(dataclasses.asdict(self)))
+        if not complete and not self.augment.strength:
+            del values["augment"]
         for section, name in (key.split(".") for key in UNSAID):
             if not complete and values[section][name] == UNSAID[f"{section}.{name}"]:
                 del values[section][name]

@@ -1,15 +1,18 @@
 """All methods of ``train-encoder`` share the loop that trains on camera frames."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
 
+from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import EncoderSettings
 from hjepa_cli.core.networks.model import UNSAID
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import FrameWindows
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.core.training.jepa import Jepa
@@ -35,7 +38,8 @@ def fit(
 ) -> None:
     """Train for ``encoder.steps`` steps, all phases on the same windows.
 
-    Every batch is ``batch_trajectories`` windows of ``batch_frames`` frames, h steps apart. Every
+    Every batch is ``batch_trajectories`` windows of ``batch_frames`` frames, h steps apart, which
+    networks see augmented, if the settings say so. Every
     epoch ``look`` is called with the loss terms and returns a row of ``metrics.csv``.
 
     Raises:
@@ -65,7 +69,8 @@ def fit(
         frames_each=options.frames,
     )
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories
-    share = ranks.share(count)
+    share, device = ranks.share(count), resolve_device(run.settings.device)
+    augment = Augmentation(run.settings.augment)
     part = (share.stop - share.start) / count  # 1 on a single process
     epoch_steps = max(train.states[..., 0].numel() // (count * windows.window_frames), 1)
     terms: dict[str, Tensor] = {}
@@ -73,6 +78,9 @@ def fit(
     def draw() -> Drawn:
         objective.train()
         batch = windows.draw(count, stream, share)
+        if seeds := augment.draw(count, stream):
+            worse = augment(batch.frames.to(device), seeds[share])
+            batch = dataclasses.replace(batch, worse=worse)
         losses = objective.losses(batch)
         terms.update({name: part * term for name, term in losses.items()})
         return objective.total(terms), lambda: batch.drawn

@@ -221,6 +221,7 @@ def trained_alike(source: Checkpoint, data: Dataset, settings: Settings) -> bool
     return (
         (metadata["dataset"], metadata["seed"]) == (data.digest, settings.seed)
         and theirs["actor"] == mine["actor"]
+        and theirs.get("augment") == mine.get("augment")
         and all(theirs["encoder"].get(key, 0) == mine["encoder"][key] for key in PICTURE_SETTINGS)
         and all(theirs["hierarchy"].get(key) == mine["hierarchy"][key] for key in FLAT_SETTINGS)
     )
@@ -330,6 +331,8 @@ def draw_batch(
 
 def join(views: list[EmbeddedTrajectories]) -> EmbeddedTrajectories:
     """Return all views of the trajectories as one set."""
-    return EmbeddedTrajectories(
-        torch.cat([view.z for view in views]), torch.cat([view.actions for view in views])
-    )
+    clean = None
+    if any(view.clean is not None for view in views):
+        clean = torch.cat([view.targets for view in views])
+    z, actions = (torch.cat([getattr(view, name) for view in views]) for name in ("z", "actions"))
+    return EmbeddedTrajectories(z, actions, clean)

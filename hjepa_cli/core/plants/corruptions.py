@@ -32,13 +32,14 @@ def light(pictures: Pictures, factor: float, random: Generator) -> Pictures:
 
 def gamma(pictures: Pictures, exponent: float, random: Generator) -> Pictures:
     """Bend the camera's curve: v ↦ v^γ of values between black 0 and white 1."""
-    bent: Pictures = np.power(np.clip(pictures, 0, 255) / np.float32(255), np.float32(exponent))
-    return 255 * bent
+    share = np.clip(pictures, 0, 255).astype(np.float32) / 255
+    bent: Pictures = (255 * np.power(share, exponent)).astype(np.float32)
+    return bent
 
 
 def colour(pictures: Pictures, share: float, random: Generator) -> Pictures:
     """Make light warmer by a share: red by 1, blue by 1/(1 + share)², green between them."""
-    return pictures / np.array([1, 1 + share, (1 + share) ** 2], np.float32)
+    return pictures / (1 + np.float32(share)) ** np.arange(3, dtype=np.float32)
 
 
 def gradient(pictures: Pictures, share: float, random: Generator) -> Pictures:

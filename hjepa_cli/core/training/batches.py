@@ -25,12 +25,19 @@ class TrajectoryBatch:
         actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
         drawn: the windows' names, for messages.
         labels: the teacher's actions there ÷ force limit [B · F, *A], if the windows have any.
+        worse: what a network shall see instead of ``frames``, of which targets are made.
     """
 
     frames: Tensor
     actions: Tensor
     drawn: str = ""
     labels: Tensor | None = None
+    worse: Tensor | None = None
+
+    @property
+    def seen(self) -> Tensor:
+        """Return what a network sees that learns."""
+        return self.frames if self.worse is None else self.worse
 
 
 def window_indices(
