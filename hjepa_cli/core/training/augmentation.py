@@ -33,12 +33,12 @@ class Augmentation:
     """
 
     def __init__(self, settings: AugmentSettings) -> None:
-        self._settings = settings
+        self._of = settings
 
     @property
     def on(self) -> bool:
         """Return whether it does anything."""
-        return self._settings.strength > 0
+        return self._of.strength > 0
 
     def draw(self, count: int, generator: np.random.Generator) -> list[int] | None:
         """Draw seeds for windows; ``None``, and no draw, where it is off."""
@@ -71,7 +71,7 @@ class Augmentation:
             on_device = torch.Generator(before.device).manual_seed(seed)
         strip = torch.randn(NOISE_INPUTS * size, generator=on_device, device=before.device)
         for clean, worse, drawn, moves_px in zip(before, after, numbers, jitter_px, strict=True):
-            draws = _Draws(self._settings, drawn)
+            draws = _Draws(self._of, drawn)
             pictures = self._moved(clean.float(), moves_px, draws)
             self._cover(pictures, draws)
             pictures = self._blurred(pictures, draws)
@@ -83,8 +83,8 @@ class Augmentation:
     def _moved(self, pictures: Tensor, moves_px: Tensor, draws: "_Draws") -> Tensor:
         """Turn pictures [κ, H, W, 3] around their middle, and move each by parts of a pixel."""
         chosen = draws.chosen()
-        angle = math.radians(draws.both_ways("rotation_deg", chosen))
-        jitter_px = draws.most("jitter_px") * chosen
+        angle = math.radians(draws.both_ways(self._of.rotation_deg, chosen))
+        jitter_px = draws.most(self._of.jitter_px) * chosen
         if not (angle or jitter_px):
             return pictures
         height, width = pictures.shape[1:3]
@@ -103,7 +103,7 @@ class Augmentation:
     def _cover(self, pictures: Tensor, draws: "_Draws") -> None:
         """Put a rectangle of one grey before all frames, anywhere."""
         height, width = pictures.shape[1:3]
-        chosen, most = draws.chosen(), draws.most("rectangle_px")
+        chosen, most = draws.chosen(), draws.most(self._of.rectangle_px)
         rows, columns = (round(chosen * most * draws.uniform()) for _ in range(2))
         rows, columns = min(rows, height), min(columns, width)
         top = int(draws.uniform() * (height - rows + 1))
@@ -112,7 +112,7 @@ class Augmentation:
 
     def _blurred(self, pictures: Tensor, draws: "_Draws") -> Tensor:
         """Blur some pictures; half as many as have other effects, since it takes long."""
-        chosen, most_px = draws.chosen() * draws.coin(), draws.most("blur_px")
+        chosen, most_px = draws.chosen() * draws.coin(), draws.most(self._of.blur_px)
         width_px = chosen * draws.uniform() * min(most_px, FARTHEST_BLUR_PX)
         if width_px < 0.1:
             return pictures
@@ -126,21 +126,21 @@ class Augmentation:
     def _light(self, pictures: Tensor, draws: "_Draws") -> None:
         """Change the light, let it fall off across, flicker between frames, and bend the curve."""
         frames, height, width, channels = pictures.shape
-        gain, chosen = 1 + draws.both_ways("gain", draws.chosen()), draws.chosen()
-        colour = [1 + draws.both_ways("colour", chosen) for _ in range(channels)]
+        gain, chosen = 1 + draws.both_ways(self._of.gain, draws.chosen()), draws.chosen()
+        colour = [1 + draws.both_ways(self._of.colour, chosen) for _ in range(channels)]
         chosen = draws.chosen()
-        most = draws.most("flicker") * chosen
+        most = draws.most(self._of.flicker) * chosen
         flicker = [1 - most * draws.uniform() for _ in range(frames)]
         factors = gain * torch.tensor(flicker)[:, None] * torch.tensor(colour)
         pictures.mul_(factors[:, None, None].to(pictures))
-        fall = draws.most("gradient") * draws.chosen() * draws.uniform()
+        fall = draws.most(self._of.gradient) * draws.chosen() * draws.uniform()
         angle = 2 * math.pi * draws.uniform()
         if fall:
             down = math.sin(angle) * torch.linspace(-0.5, 0.5, height)
             right = math.cos(angle) * torch.linspace(-0.5, 0.5, width)
             light = 1 - fall * (0.5 + down[:, None] + right)
             pictures.mul_(light[:, :, None].to(pictures))
-        bent = draws.both_ways("gamma", draws.chosen())
+        bent = draws.both_ways(self._of.gamma, draws.chosen())
         if bent:  # a parabola through black, white and what the exponent makes of mid-grey
             exponent = 1 + bent if bent > 0 else 1 / (1 - bent)
             bend = 4 * (0.5**exponent - 0.5)
@@ -150,8 +150,8 @@ class Augmentation:
     def _add_noise(self, pictures: Tensor, drawn: Tensor, draws: "_Draws") -> None:
         """Add noise of the sensor, and of the light, which grows with it, to every value."""
         chosen = draws.chosen()
-        read = chosen * draws.most("read_noise") * draws.uniform()
-        shot = chosen * draws.most("shot_noise") * draws.uniform()
+        read = chosen * draws.most(self._of.read_noise) * draws.uniform()
+        shot = chosen * draws.most(self._of.shot_noise) * draws.uniform()
         if shot:
             width = pictures.mul(shot**2 / 255).clamp_(0).add_(read**2).sqrt_()
             pictures.addcmul_(width, drawn)
@@ -163,7 +163,7 @@ class _Draws:
     """It hands out the uniform numbers that were drawn for an input."""
 
     def __init__(self, settings: AugmentSettings, numbers: list[float]) -> None:
-        self._settings, self._numbers = settings, iter(numbers)
+        self._of, self._numbers = settings, iter(numbers)
 
     def uniform(self) -> float:
         """Return a number from 0 to 1."""
@@ -175,12 +175,12 @@ class _Draws:
 
     def chosen(self) -> int:
         """Return 1 if the input has an effect, else 0."""
-        return int(self.uniform() < self._settings.share)
+        return int(self.uniform() < self._of.share)
 
-    def most(self, name: str) -> float:
-        """Return the most of an effect that the settings allow."""
-        return float(getattr(self._settings, name)) * self._settings.strength
+    def most(self, at_one: float) -> float:
+        """Return the most of an effect, by what it is at a strength of 1."""
+        return at_one * self._of.strength
 
-    def both_ways(self, name: str, chosen: int) -> float:
+    def both_ways(self, at_one: float, chosen: int) -> float:
         """Return a severity of an effect up to the most, either way; 0 unless it is chosen."""
-        return chosen * self.most(name) * (2 * self.uniform() - 1)
+        return chosen * self.most(at_one) * (2 * self.uniform() - 1)
