@@ -32,7 +32,7 @@ LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss
 MEASURED = (
     *(*LOOP, "protocol.process_noise", "protocol.plant_spread", "protocol.payload"),
     *LINK,
-    "conditions.stress",
+    *("conditions.stress", "protocol.false_alarm"),
 )
 
 Given = dict[str, Any]  # what was given, by dotted key or argument; None: not given
@@ -195,8 +195,8 @@ COMMANDS = (
         Imported("hjepa_cli.stages.view:run"),
         (
             *("methods:view", "devices", "snr_db", "delivery", "gap_steps", "every", "fps", "live"),
-            *("radio.bandwidth_hz", *LINK, "conditions.stress", "checkpoint", "out:animation"),
-            *COMPUTED,
+            *("radio.bandwidth_hz", *LINK, "conditions.stress", "protocol.false_alarm"),
+            *("checkpoint", "out:animation", *COMPUTED),
         ),
         plan=Imported("hjepa_cli.stages.view:plan"),
         product="file",

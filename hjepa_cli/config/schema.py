@@ -270,6 +270,16 @@ class ProtocolSettings:
         BelowOne,
         Flag("--downlink-loss", "Share of datagrams with forces that are lost.", "FRACTION"),
     ] = 0.0
+    false_alarm: Annotated[
+        BelowOne,
+        Flag(
+            "--false-alarm",
+            "Flag packets that look like nothing in training, and go on predicting; so many "
+            "familiar ones may be flagged too. 0: look at none.",
+            "FRACTION",
+        ),
+    ] = 0.0
+    flagged_in_row: Count = 3  # as many are kept back; the next one counts, whatever it is
     payload: Annotated[
         str,
         Flag(
@@ -306,6 +316,8 @@ class ProtocolSettings:
 # settings, and so do digests.
 UNSAID = {
     **dict.fromkeys(("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss"), 0),
+    "protocol.false_alarm": 0.0,
+    "protocol.flagged_in_row": 3,
     "encoder.photometric": "none",
     "conditions.stress": "",
 }

@@ -95,6 +95,11 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
         ["method", *(f"{point['d']:g}" for point in first["gap_curve"])],
         scores,
     )
+    for name, entry in entries.items():
+        flagged = [point["flagged"] for point in entry["gap_curve"] if "flagged" in point]
+        if flagged:
+            shares = ", ".join(f"{share:.1%}" for share in flagged)
+            screen.say(f"{name}: packets flagged, by gap: {shares}")
     for name, path in result.get("checkpoints", {}).items():
         if path != result["checkpoint"]:
             screen.say(f"{name} is of model {path}")
@@ -104,15 +109,22 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
 def show_stress(result: dict[str, Any], screen: Screen) -> None:
     """Print a table per method: scores under conditions, with their share of the nominal ones."""
     stress = result["stress"]
-    gaps = stress["gaps"]
     for name, entry in stress["methods"].items():
         screen.table(
             f"{result['plant']}, seed {result['seed']}: score of {name} by gap D between packets "
             f"({stress['n_devices']} devices, {described_steps(stress)}, 95 % CI), and ÷ its "
             "nominal score",
-            ["condition", *(f"D = {gap}" for gap in gaps), *(f"÷ nominal, {gap}" for gap in gaps)],
+            stress_columns(stress, entry),
             stress_rows(entry),
         )
+
+
+def stress_columns(stress: dict[str, Any], entry: dict[str, Any]) -> list[str]:
+    """Return the headings of :func:`stress_rows`."""
+    gaps = stress["gaps"]
+    flagged = ["flagged"] * ("flagged" in entry["nominal"][0])
+    shares = (f"÷ nominal, {gap}" for gap in gaps)
+    return ["condition", *(f"D = {gap}" for gap in gaps), *shares, *flagged]
 
 
 def stress_rows(entry: dict[str, Any]) -> list[list[str | None]]:
@@ -125,6 +137,7 @@ def stress_rows(entry: dict[str, Any]) -> list[list[str | None]]:
             name,
             *(span(point["score"], point["ci95"], 2) for point in points),
             *(_number(point["relative"], 2) for point in points),
+            *([_number(points[0].get("flagged"), 3)] if "flagged" in entry["nominal"][0] else []),
         ]
         for name, points in rows
     ]

@@ -18,7 +18,7 @@ from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
-from hjepa_cli.output.tables import stress_rows
+from hjepa_cli.output.tables import stress_columns, stress_rows
 from hjepa_cli.storage import files, runs
 
 Result = dict[str, Any]
@@ -120,7 +120,7 @@ def page_template() -> Template:
         "percent": percent,
         "sprintf": lambda value, text: text % value,
     }
-    named = (gates, in_order, ranked, span, stress_rows, tolerance, windows)
+    named = (gates, in_order, ranked, span, stress_columns, stress_rows, tolerance, windows)
     environment.globals |= {one.__name__: one for one in named} | {"version": __version__}
     return environment.get_template("report.html.j2")
 

@@ -46,10 +46,13 @@ class Believer:
         self._last: torch.Tensor | None = None
         self._heard = False
         self.believed: list[Floats] = []
+        self.flagged: list[Bools] = []
 
     def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]."""
         forces_n = self._controller.act(delivered, packets, ages)
+        check = getattr(self._controller, "check", None)
+        self.flagged.append(np.zeros_like(delivered) if check is None else check.now.copy())
         self._heard |= packets is not None
         if not self._heard:  # the link is late: a device is believed to be at rest
             states = np.zeros((len(delivered), self._probe.shape[1]))
@@ -256,4 +259,5 @@ def film(
             tick=bar.advance,
             watch=lambda k, now, forces_n: states.append(now.copy()),
         )
-    return Film(name, np.stack(states), np.stack(believer.believed), kind.in_band(np.stack(states)))
+    in_band, flagged = kind.in_band(np.stack(states)), np.stack(believer.flagged)
+    return Film(name, np.stack(states), np.stack(believer.believed), in_band, flagged)

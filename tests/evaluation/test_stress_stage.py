@@ -86,3 +86,19 @@ def test_what_cannot_be_measured_is_refused_before_anything_is_written(row, tmp_
     with pytest.raises(UsageError, match=row.partition("=")[0]):
         evaluate.run(settings, Screen(quiet=True), checkpoint=model, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_flagged_packets_are_counted_in_curves_and_rows(tmp_path) -> None:
+    changes = {"protocol.false_alarm": 0.05, "methods": ("hjepa",), "protocol.gaps": (1, 5)}
+    quiet = Screen(quiet=True)
+    small = load_settings("smoke", flags=changes)
+    evaluated = evaluate.run(small, quiet, checkpoint="desktop-h4m2l1", out=tmp_path / "curves")
+    every, five = evaluated["methods"]["hjepa"]["gap_curve"]
+    assert "flagged" not in every, "with every packet nothing is predicted"
+    assert 0 <= five["flagged"] < 0.2
+    black = load_settings("smoke", flags=changes | {"stress": ("black=1",)})
+    found = evaluate.run(black, quiet, checkpoint="desktop-h4m2l1", out=tmp_path / "stress")
+    entry = found["stress"]["methods"]["hjepa"]
+    assert entry["rows"][0]["points"][0]["flagged"] == 1.0 > entry["nominal"][0]["flagged"]
+    report.run(quiet, [tmp_path / "stress"], out=tmp_path / "report.html")
+    assert "flagged" in (tmp_path / "report.html").read_text()

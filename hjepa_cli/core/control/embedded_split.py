@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
 
 
+SAMPLED = 2000  # embeddings that fits without labels take
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class EmbeddedSplit:
     """Holds embedded trajectories of one split.
@@ -48,6 +51,14 @@ def embed_split(model: "Model", settings: Settings, split: str) -> EmbeddedSplit
         drawn.states[:, 1:].astype(np.float64),
         drawn.applied_n.reshape(count, steps, -1).astype(np.float64) / kind.force_limit_n,
     )
+
+
+def sampled_embeddings(model: "Model", settings: Settings, split: str) -> Tensor:
+    """Embed about :data:`SAMPLED` pictures of a split of the settings, evenly spaced: [n, D]."""
+    states = generate(settings, split).states
+    shown = states[:, frames_seen(np.arange(states.shape[1] - 1), model.frames)]
+    shown = shown.reshape(-1, *shown.shape[2:])
+    return embed_states(model, shown[:: max(1, len(shown) // SAMPLED)])
 
 
 def embed_states(model: "Model", seen: Floats) -> Tensor:

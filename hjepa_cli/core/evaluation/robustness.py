@@ -68,12 +68,13 @@ def mean_of(
 
 def kept(outcome: Outcome) -> dict[str, Any]:
     """Return an outcome as plain data, which :func:`taken` reads."""
-    return {name: values.tolist() for name, values in vars(outcome).items()}
+    return {name: None if of is None else of.tolist() for name, of in vars(outcome).items()}
 
 
 def taken(values: Mapping[str, Any]) -> Outcome:
     """Return the outcome of :func:`kept`."""
-    return Outcome(**{name: np.array(of, np.float64) for name, of in values.items()})
+    arrays = {name: np.array(of) for name, of in values.items() if of is not None}
+    return Outcome(**arrays)
 
 
 def _weights(outcome: Outcome, reference: Reference) -> Floats:

@@ -35,7 +35,7 @@ def predictor(name: str, planner: Callable[[Model], Planner], **about: Any) -> M
         from hjepa_cli.core.control.drivers import embedding_driver
         from hjepa_cli.core.control.planners import OnePredictor
 
-        drives = _strides(model, planner(model))
+        drives = _strides(settings, model, planner(model))
 
         def two_levels(devices: int) -> TwoLevels:
             step = OnePredictor(model, model.networks["flat"], 1).step
@@ -48,10 +48,14 @@ def predictor(name: str, planner: Callable[[Model], Planner], **about: Any) -> M
     return Method(name, "embedding", build, planner=planner, **about)
 
 
-def _strides(model: Model, planner: Planner) -> Callable[[int], StrideController]:
+def _strides(
+    settings: Settings, model: Model, planner: Planner
+) -> Callable[[int], StrideController]:
     from hjepa_cli.core.control.controllers import StrideController
+    from hjepa_cli.core.control.drivers import check_of
 
-    return functools.partial(StrideController, planner, action_shape=model.action_shape)
+    check, shape = check_of(settings, model), model.action_shape
+    return functools.partial(StrideController, planner, action_shape=shape, check=check)
 
 
 def _hierarchy(model: Model) -> Planner:
@@ -113,7 +117,7 @@ def _linear(settings: Settings, model: Model) -> Driver:
     from hjepa_cli.core.control.linear_latent import LinearPlanner, fit_linear_latent
 
     planner = LinearPlanner(fit_linear_latent(model, settings), model.actor, model.force_limit_n)
-    return embedding_driver("linear", settings, model, _strides(model, planner))
+    return embedding_driver("linear", settings, model, _strides(settings, model, planner))
 
 
 LINEAR = Method(
