@@ -91,8 +91,9 @@ class EncoderSettings:
     ] = "jepa"
     frames: Annotated[  # κ
         Count,
-        Flag("--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
+        Flag("--frames", "Frames of the input: 2 or 4; 2 with --method autoencoder."),
     ] = 2
+    frame_gap: Count = 1  # control steps between them
     embedding: Count = 256
     hidden: Count = 1024
     h: Annotated[Count, STRIDE_H] = 4
@@ -319,6 +320,7 @@ UNSAID = {
     "protocol.false_alarm": 0.0,
     "protocol.flagged_in_row": 3,
     "encoder.photometric": "none",
+    "encoder.frame_gap": 1,
     "conditions.stress": "",
 }
 

@@ -42,14 +42,15 @@ def train(
     networks: nn.ModuleDict, run: TrainingRun, train: RenderedSplit, test: RenderedSplit
 ) -> dict[str, Any]:
     """Train a baseline in place; return its held-out health."""
-    device, frames = resolve_device(run.settings.device), run.settings.encoder.frames
-    _standardise(networks, standardisation_sample(train.frames, frames_each=frames))
-    look = functools.partial(_look, networks, test, run.settings)
+    device, options = resolve_device(run.settings.device), run.settings.encoder
+    look = {"frames_each": options.frames, "frame_gap": options.frame_gap}
+    _standardise(networks, standardisation_sample(train.frames, **look))
+    watch = functools.partial(_look, networks, test, run.settings)
     trained: tuple[str, ...] = ("encoder", "actor")
     if "decoder" in networks:
-        fit(run, train, "autoencoder", Reconstruction(networks, device), look)
+        fit(run, train, "autoencoder", Reconstruction(networks, device), watch)
         trained = ("reader", "actor")
-    fit(run, train, "actor", Imitation(networks, trained, device), look)
+    fit(run, train, "actor", Imitation(networks, trained, device), watch)
     networks.eval()
     run.screen.say("measuring health on all frames")
     return examine(networks, train, test, run.settings)
@@ -101,8 +102,9 @@ def _read(
     networks: nn.ModuleDict, split: RenderedSplit, settings: Settings, *, every: int
 ) -> torch.Tensor:
     """Return what the actor listens to in every ``every``-th step: embeddings [N · K, D]."""
-    read, frames = functools.partial(read_frames, networks), settings.encoder.frames
-    return embed(read, split, settings, every=every, frames=frames).flatten(0, 1)
+    read, options = functools.partial(read_frames, networks), settings.encoder
+    look = options.frames, options.frame_gap
+    return embed(read, split, settings, every=every, look=look).flatten(0, 1)
 
 
 @torch.inference_mode()
@@ -120,7 +122,8 @@ def _reconstruction_error(
     networks: nn.ModuleDict, split: RenderedSplit, settings: Settings
 ) -> float:
     """Return mean squared error ÷ variance of a channel, of evenly spaced frames."""
-    seen = split.seen(LOOK_EVERY, frames=settings.encoder.frames)
+    options = settings.encoder
+    seen = split.seen(LOOK_EVERY, frames=options.frames, frame_gap=options.frame_gap)
     device = resolve_device(settings.device)
     objective = Reconstruction(networks, device)
     chosen = seen[:: max(len(seen) // LOOK_FRAMES, 1)]

@@ -67,6 +67,7 @@ def fit(
         mirrored_actions=kind.mirror,
         labels=labels_of(train, kind, control_law(kind, run.settings.control)),
         frames_each=options.frames,
+        frame_gap=options.frame_gap,
     )
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories
     share, device = ranks.share(count), resolve_device(run.settings.device)

@@ -37,23 +37,27 @@ def embed(
     settings: Settings,
     *,
     every: int = 1,
-    frames: int = 2,
+    look: tuple[int, int] | None = None,
     mirrored: bool = False,
     shifts_px: NDArray[np.int64] | None = None,
     seeds: list[int] | None = None,
     advance: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
-    """Return frozen embeddings [N, K, D] of k = 0, ``every``, …, from κ frames.
+    """Return frozen embeddings [N, K, D] of k = 0, ``every``, …
+
+    ``look`` says how many frames the encoder sees and how many steps these are apart, unless it
+    says so itself.
 
     ``mirrored`` takes the frames' mirror images; each trajectory is then moved right by
     ``shifts_px`` [N], and augmented by ``seeds`` [N].
     """
     device = resolve_device(settings.device)
     precision, augment = settings.encoder.precision, Augmentation(settings.augment)
+    frames, frame_gap = look or getattr(encoder, "look", (2, 1))
     parts = []
     for start in range(0, len(split.frames), CHUNK):
         part = split.slice(start, start + CHUNK)
-        seen = part.seen(every, frames=frames, mirrored=mirrored)
+        seen = part.seen(every, frames=frames, frame_gap=frame_gap, mirrored=mirrored)
         if shifts_px is not None:
             by_trajectory = seen.unflatten(0, (len(part.frames), -1))
             moved = zip(by_trajectory, shifts_px[start : start + CHUNK].tolist(), strict=True)

@@ -167,7 +167,8 @@ def train_jepa(
     kind = plant(settings.plant)
     encoder, companion = modules["encoder"], modules["high"]
     assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
-    encoder.fit_standardisation(standardisation_sample(train.frames))
+    look = {"frames_each": options.frames, "frame_gap": options.frame_gap}
+    encoder.fit_standardisation(standardisation_sample(train.frames, **look))
     if ranks.size > 1:
         if options.regulariser != "none":
             raise UsageError(

@@ -179,7 +179,7 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
             config = read_config(run)
             encoder = config["encoder"]
             is_jepa = encoder.get("method", "jepa") == "jepa"
-            keys = (*train_encoder.ARCHITECTURE, "frames", "photometric")
+            keys = (*train_encoder.ARCHITECTURE, "frames", "frame_gap", "photometric")
             alike = all(encoder.get(key) == wanted.get(key) for key in keys)
             return is_jepa and alike and config["plant"] == settings.plant
 

@@ -21,7 +21,7 @@ from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import frames_of, frames_seen
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.radio.channel import rayleigh_power_gains
@@ -233,8 +233,8 @@ def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
     with screen.progress("fit probe", count, "trajectories") as bar:
         for trajectory in recorded.states:
             now = np.arange(1, len(trajectory), PROBE_EVERY)
-            pairs = trajectory[np.stack([now - 1, now], axis=1)]
-            embeddings.append(model.encode(frames_of(camera, pairs)))
+            shown = trajectory[frames_seen(now - 1, *model.look)]
+            embeddings.append(model.encode(frames_of(camera, shown)))
             states.append(torch.from_numpy(trajectory[now]))
             bar.advance()
     return health.fit_probe(torch.cat(embeddings), torch.cat(states))

@@ -57,7 +57,8 @@ class Controller(Protocol):
 
 
 Sensor = Callable[[Floats], Any]
-"""The device side: the last states of m devices [m, 4, S], the present one last → packets [m, ...].
+"""The device side makes packets [m, ...] of the last states of m devices [m, 16, S], the present
+one last.
 
 Those before a device was switched on are copies of its first; see
 :func:`~hjepa_cli.core.plants.frames.frames_seen`.

@@ -83,7 +83,7 @@ class Encoder(nn.Module):
             their length bends them little there and states stay linearly readable (docs/LOG.md).
         symmetric: whether the embedding of a mirrored picture is the reflected embedding; D is
             even then, and the offset is on the even half.
-        frames: κ, the current one and κ − 1 earlier ones.
+        frames, frame_gap: κ, the current one and κ − 1 earlier ones, and the steps between them.
         photometric: whether every frame is fitted to its background first, and by what; see
             :func:`~hjepa_cli.core.networks.photometry.against_background`.
     """
@@ -100,10 +100,11 @@ class Encoder(nn.Module):
         symmetric: bool = False,
         frames: int = 2,
         photometric: str = "none",
+        frame_gap: int = 1,
     ) -> None:
         super().__init__()
         self.embedding, self.frame_input, self.symmetric = embedding, frame_input, symmetric
-        self.photometric = photometric
+        self.photometric, self.look = photometric, (frames, frame_gap)
         channels = frames * CHANNELS
         self.register_buffer("input_mean", torch.zeros(channels))
         self.register_buffer("input_std", torch.ones(channels))

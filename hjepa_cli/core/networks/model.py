@@ -21,6 +21,7 @@ from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
 from hjepa_cli.core.networks.photometry import FITS
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
+from hjepa_cli.core.plants.frames import LONGEST
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, UsageError
@@ -32,13 +33,18 @@ KINDS = ("encoder", "hierarchy", "flat", "supervised", "autoencoder", "reflex")
 CHOICES = {  # of an architecture; its other values are sizes
     "frame_input": ("difference", "pair"),
     "frames": (2, 4),
+    "frame_gap": tuple(range(1, LONGEST)),
     "stride_actions": ("all", "held"),
     "centre": (True, False),
     "residual": (True, False),
     "mirror": ("exact", "augment", "none"),
     "photometric": FITS,
 }
-UNSAID = {"frames": 2, "photometric": "none"}  # of an encoder, where its architecture has no such
+UNSAID = {
+    "frames": 2,
+    "frame_gap": 1,
+    "photometric": "none",
+}  # of an encoder, where its architecture has no such
 PRECISIONS = ("auto", "bf16", "fp32")
 LEVELS = {  # of each kind that has some, in the order of the checkpoint
     "encoder": ("high",),
@@ -78,8 +84,8 @@ def build_modules(
 
     def encoder() -> Encoder:
         frame_input, centre = architecture["frame_input"], architecture["centre"]
-        photometric = architecture["photometric"]
-        return Encoder(embedding, frame_input, centre, symmetric, frames, photometric)
+        photometric, gap = architecture["photometric"], architecture["frame_gap"]
+        return Encoder(embedding, frame_input, centre, symmetric, frames, photometric, gap)
 
     def actor() -> Actor:
         hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
@@ -266,7 +272,10 @@ class Model:
         self.precision: str = metadata["settings"]["encoder"]["precision"]
         kind = plant(self.plant_name)
         self.force_limit_n, self.action_shape = kind.force_limit_n, kind.action_shape
-        self.frames: int = self.architecture.get("frames", UNSAID["frames"])
+        self.frames, frame_gap = (
+            {**UNSAID, **self.architecture}[k] for k in ("frames", "frame_gap")
+        )
+        self.look: tuple[int, int] = (self.frames, frame_gap)
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
         is_reflex = self.architecture["kind"] == "reflex"

@@ -9,16 +9,21 @@ from hjepa_cli.core.plants.system import Camera
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 FRAME_SHAPE = (HEIGHT_PX, WIDTH_PX, CHANNELS)
 FRAME_BITS = HEIGHT_PX * WIDTH_PX * CHANNELS * 8  # uncompressed
-LONGEST = 4  # frames, κ; a device keeps so many
+LONGEST = 16  # frames that a device keeps, from which its network sees κ
 
 
-def frames_seen(k: ArrayLike, frames: int) -> Integers:
+def frames_seen(k: ArrayLike, frames: int, gap: int = 1) -> Integers:
     """Return the stored frames that a device looks at in step k: int64 [*K, κ], the oldest first.
 
-    The last of the κ is that of step k [*K] itself. Frame 0 is the one before k = 0, where a
-    device is switched on; what would lie before it is a copy of it.
+    They are ``gap`` steps apart; the last of the κ is that of step k [*K] itself. Frame 0 is the
+    one before k = 0, where a device is switched on; what would lie before it is a copy of it.
     """
-    return np.maximum(np.asarray(k)[..., None] + np.arange(2 - frames, 2), 0)
+    return np.maximum(np.asarray(k)[..., None] + 2 + frames_back(frames, gap), 0)
+
+
+def frames_back(frames: int, gap: int = 1) -> Integers:
+    """Return the indices [κ] of what a network sees among the last frames of a device."""
+    return gap * np.arange(1 - frames, 1) - 1
 
 
 def frames_of(camera: Camera, states: ArrayLike, batch: int | None = None) -> Pixels:
