@@ -12,6 +12,7 @@ from hjepa_cli.config.checks import check_payload
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.codecs.principal_components import fit_components
 from hjepa_cli.core.networks.encoder import normalise
+from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import UsageError
 from hjepa_cli.plugins import CODECS
 
@@ -20,7 +21,7 @@ class Seen:
     """A stand-in for a model: embeddings that are a smooth function of the pole's pixels."""
 
     plant_name, architecture = "desktop", {"embedding": 16}
-    frames, device = 2, "cpu"
+    camera, look, device = plant("desktop").camera(), (2, 1), "cpu"
 
     def __init__(self):
         self.mix = torch.from_numpy(np.random.default_rng(0).normal(size=(16, 16))).float()
