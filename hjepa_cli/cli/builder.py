@@ -112,7 +112,7 @@ def _explained(parameter: Any, settings: Settings) -> Any:
         value = f"{value / taken(key).unit:g}"
     elif isinstance(value, tuple):
         value = ", ".join(map(str, value))
-    parameter.default, parameter.show_default = value, True
+    parameter.default, parameter.show_default = value, value != ""
     if key in NAMES:
         parameter.help = parameter.help.replace("{choices}", ", ".join(NAMES[key]))
         parameter.metavar = parameter.metavar or "|".join(NAMES[key])

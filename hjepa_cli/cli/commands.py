@@ -34,6 +34,7 @@ LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss
 MEASURED = (
     *(*LOOP, "protocol.process_noise", "protocol.plant_spread", "protocol.payload"),
     *LINK,
+    *("conditions.stress", "protocol.false_alarm"),
 )
 
 Given = dict[str, Any]  # what was given, by dotted key or argument; None: not given
@@ -91,7 +92,7 @@ def _one_level(given: Given) -> None:
 
 
 def _figure_of_all(given: Given) -> None:
-    if given["figure"] and given["methods"] is None:
+    if given["figure"] and given["methods"] is None and given["stress"] is None:
         given["methods"] = compared_methods()
 
 
@@ -211,7 +212,7 @@ COMMANDS = (
     staged(
         "eval",
         takes=(
-            *(*MEASURED, "remeasure", "figure", "checkpoint", "dataset:clean", "out"),
+            *(*MEASURED, "stress", "remeasure", "figure", "checkpoint", "dataset:clean", "out"),
             *(*COMPUTED, *PARALLEL),
         ),
         prepare=_figure_of_all,
@@ -243,7 +244,8 @@ COMMANDS = (
         Imported("hjepa_cli.stages.view:run"),
         (
             *("methods:view", "devices", "snr_db", "delivery", "gap_steps", "every", "fps", "live"),
-            *("radio.bandwidth_hz", *LINK, "checkpoint", "out:animation", *COMPUTED),
+            *("radio.bandwidth_hz", *LINK, "conditions.stress", "protocol.false_alarm"),
+            *("checkpoint", "out:animation", *COMPUTED),
         ),
         plan=Imported("hjepa_cli.stages.view:plan"),
         product="file",

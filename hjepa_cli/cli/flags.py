@@ -37,8 +37,8 @@ DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
 WIRE, UPLINK, DOWNLINK = "Wire", "Uplink", "Downlink"
 SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
 PANELS = {  # of help, by section
-    "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "radio": RADIO,
-    "nr": RADIO, "survival": LOOP,
+    "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "conditions": LOOP,
+    "radio": RADIO, "nr": RADIO, "survival": LOOP,
     "": SETTINGS,
 }  # fmt: skip
 
@@ -592,7 +592,7 @@ def taken(name: str) -> Input:
         offered = completion.several(named) if listed else named
     elif name == "protocol.payload":
         offered = completion.payloads
-    panel = LOOP if name == "methods" else PANELS[name.rpartition(".")[0]]
+    panel = LOOP if name in ("methods", "stress") else PANELS[name.rpartition(".")[0]]
     return Input(hint, **vars(flag), complete=offered, panel=panel)
 
 

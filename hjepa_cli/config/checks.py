@@ -28,7 +28,8 @@ from hjepa_cli.plugins import CODECS, LAWS, METHODS, PHYS, PLANTS, SCHEDULERS, R
 
 LATE = "+"  # between a method and the steps that its packets are late
 
-FRAMES = {"jepa": (2,), "supervised": (2, 4), "autoencoder": (2,)}  # κ, by --method
+FRAMES = {"jepa": (2, 4), "supervised": (2, 4), "autoencoder": (2,)}  # κ, by --method
+FARTHEST_BACK = 15  # steps that a device remembers frames of
 
 LARGEST_STRIDE = 10_000
 
@@ -328,6 +329,13 @@ def _check_encoder(encoder: EncoderSettings) -> None:
         raise UsageError(
             f"--frames {encoder.frames}; method {encoder.method} takes {fitting}",
             key="encoder.frames",
+        )
+    if (back := (encoder.frames - 1) * encoder.frame_gap) > FARTHEST_BACK:
+        most = FARTHEST_BACK // (encoder.frames - 1)
+        raise UsageError(
+            f"encoder.frame_gap = {encoder.frame_gap} of {encoder.frames} frames is {back} steps "
+            f"back; a device remembers {FARTHEST_BACK}: choose 1 to {most}",
+            key="encoder.frame_gap",
         )
     if encoder.mirror == "exact" and encoder.embedding % 2:
         raise UsageError(

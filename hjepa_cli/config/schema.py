@@ -130,12 +130,15 @@ class EncoderSettings:
     ] = "jepa"
     frames: Annotated[  # κ
         Count,
-        Flag("--frames", "Consecutive frames of the input: 2, or 4 with --method supervised."),
+        Flag("--frames", "Frames of the input: 2 or 4; 2 with --method autoencoder."),
     ] = 2
+    frame_gap: Count = 1  # control steps between them
     embedding: Width = 256
     hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
     frame_input: Literal["difference", "pair"] = "difference"
+    # Each frame is fitted to its background: not, by a gain, or by gain and offset.
+    photometric: Literal["none", "gain", "affine"] = "none"
     stride_actions: Literal["all", "held"] = "all"
     residual: bool = True
     centre: bool = True
@@ -179,6 +182,30 @@ class EncoderSettings:
         """Return the gates of the linear probes, one per state."""
         four = (self.gate_r2_x, self.gate_r2_x_dot, self.gate_r2_theta, self.gate_r2_theta_dot)
         return self.gate_r2 or four
+
+
+@dataclasses.dataclass(frozen=True)
+class AugmentSettings:
+    """Networks are trained on worse pictures, with the labels and targets of clean ones.
+
+    ``strength`` multiplies what follows it, each the most that a training picture gets; 0 is off.
+    """
+
+    strength: NotNegative = 0.0
+    share: Annotated[float, Meta(ge=0, le=1)] = 0.5  # of pictures, for each effect by itself
+    gain: BelowOne = 0.35  # ± of 1
+    gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
+    colour: BelowOne = 0.1  # ± of each channel
+    gradient: BelowOne = 0.25  # fall of light from edge to edge, in any direction
+    flicker: BelowOne = 0.02  # less light in a frame
+    shot_noise: NotNegative = 4.0  # standard deviation at white, of 255
+    read_noise: NotNegative = 10.0
+    blur_px: NotNegative = 1.75  # standard deviation
+    jitter_px: NotNegative = 0.12  # standard deviation, anew in every frame
+    rotation_deg: NotNegative = 2.5
+    rectangle_px: NotNegative = 16.0  # side, of any grey
+    # Of training pictures once more, with clean labels, for actor and predictors.
+    copies: CountOrNone = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -300,6 +327,16 @@ class ProtocolSettings:
         BelowOne,
         Flag("--downlink-loss", "Share of datagrams with forces that are lost.", "FRACTION"),
     ] = 0.0
+    false_alarm: Annotated[
+        BelowOne,
+        Flag(
+            "--false-alarm",
+            "Flag packets that look like nothing in training, and go on predicting; so many "
+            "familiar ones may be flagged too. 0: look at none.",
+            "FRACTION",
+        ),
+    ] = 0.0
+    flagged_in_row: Count = 3  # as many are kept back; the next one counts, whatever it is
     payload: Annotated[
         str,
         Flag(
@@ -338,6 +375,17 @@ class ProtocolSettings:
 
 
 IDEAL_LINK = ("delay_steps", "jitter_steps", "downlink_loss")  # all 0 in the paper
+
+# Where these are so, nothing is stored of them: all else says the same as before there were such
+# settings, and so do digests.
+UNSAID: dict[str, Any] = {
+    **dict.fromkeys((f"protocol.{key}" for key in IDEAL_LINK), 0),
+    "protocol.false_alarm": 0.0,
+    "protocol.flagged_in_row": 3,
+    "encoder.photometric": "none",
+    "encoder.frame_gap": 1,
+    "conditions.stress": "",
+}
 
 # What --protocol paper sets over these: scored from the start on.
 PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
@@ -379,6 +427,15 @@ class ConditionSettings:
     light: Annotated[float, Meta(gt=0, le=255)] = 1.0  # factor on what the camera sees
     camera_noise: GreyLevels = 0.0  # standard deviation in every pixel, of 255
     pole_length: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # ÷ the nominal one
+    stress: Annotated[
+        str,
+        Flag(
+            "--condition",
+            "Conditions of devices and pictures that no model was trained for, as "
+            "light=0.7+noise=8; hjepa eval --stress tells their names.",
+            "NAME=VALUE+…",
+        ),
+    ] = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -631,6 +688,16 @@ class Settings:
         *("hjepa", "ts-jepa-1", "ts-jepa-4", "chunk", "hold-decay-linear"),
         *("hold", "optimal", "oracle"),
     )
+    stress: Annotated[
+        tuple[str, ...],
+        Flag(
+            "--stress",
+            "Measure, instead of curves, how scores hold under conditions: audit (a fixed set), "
+            "all, or names with or without a value, separated by commas, several joined by +: "
+            "light,noise=8,light=0.7+noise=8.",
+            "A,B|audit|all",
+        ),
+    ] = ()
     control: ControlSettings = ControlSettings()
     tune: TuneSettings = TuneSettings()
     fusion: FusionSettings = FusionSettings()
@@ -638,6 +705,7 @@ class Settings:
     recorded: RecordedSettings = RecordedSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
+    augment: AugmentSettings = AugmentSettings()
     actor: ActorSettings = ActorSettings()
     hierarchy: HierarchySettings = HierarchySettings()
     reflex: ReflexSettings = ReflexSettings()
@@ -647,23 +715,29 @@ class Settings:
     nr: NrSettings = NrSettings()
     survival: SurvivalSettings = SurvivalSettings()
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self, *, complete: bool = False) -> dict[str, Any]:
         """Return nested plain data, ready for JSON (tuples become lists).
 
-        Empty lists, the zeros of an ideal link, the usual camera and what only recorded plants
-        have are left out: they stand for values that say the same, and digests of settings stay
-        what they were before there were such settings.
+        Empty lists are left out, what only recorded plants have, and unless it shall be
+        ``complete`` what is off and the usual camera: they stand for values that say the same, and
+        digests of settings stay what they were before there were such settings.
         """
         values = _without_empty(plain(dataclasses.asdict(self)))
-        for key in IDEAL_LINK:
-            if not values["protocol"][key]:
-                del values["protocol"][key]
+        usual = {
+            "augment": not self.augment.strength,
+            "camera": self.camera == CameraSettings(),
+        }
+        left_out = [name for name, is_so in usual.items() if is_so and not complete]
+        for key, value in UNSAID.items():
+            section, _, name = key.partition(".")
+            if values[section][name] == value and not complete:
+                del values[section][name]
         if not values["control"]:
-            del values["control"]
-        if self.camera == CameraSettings():
-            del values["camera"]
+            left_out.append("control")
         if self.plant != RECORDED:
-            del values["recorded"]
+            left_out.append("recorded")
+        for name in left_out:
+            del values[name]
         return values
 
 

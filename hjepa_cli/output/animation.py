@@ -31,6 +31,7 @@ MARGIN_PX, TITLE_PX, HEADER_PX = 8, 20, 34
 LEAST_WIDTH_PX = 600  # for the notes at the top
 TEXT, NAME = font(12), font(14)  # below 12 px, Pillow's letters swallow the blanks
 ARRIVED, LOST = (0, 158, 115), (213, 94, 0)  # safe for colour-blind readers
+FLAGGED = (204, 121, 167)
 DASH_PX = 7
 COLOURS = 48  # of a GIF
 MOST_GIF_FPS = 50  # viewers take a single hundredth of a second for ten
@@ -55,6 +56,8 @@ class Pictures:
         self.devices = link.delivered.shape[1]
         self._legend = "dashed: what the controller believes; bar: packet arrived"
         self._legend += "; tick: lost" * link.sends_always + link.late.replace(",", ";", 1)
+        if any(shot.flagged is not None and shot.flagged.any() for shot in films):
+            self._legend += "; pink: unfamiliar"
         self.size_px = size_px(self.devices, len(films), self._legend)
 
     def __len__(self) -> int:
@@ -114,7 +117,7 @@ class Pictures:
         scene = scene.resize((WIDTH_PX * SCALE, HEIGHT_PX * SCALE), Image.Resampling.BOX)
         self._draw_belief(ImageDraw.Draw(scene), self.sketch(shot, device, k))
         panel.paste(scene, (0, 16))
-        self._draw_slots(draw, device, k, 16 + HEIGHT_PX * SCALE + 2, PANEL_PX[1] - 1)
+        self._draw_slots(draw, shot, device, k, 16 + HEIGHT_PX * SCALE + 2, PANEL_PX[1] - 1)
         return panel
 
     def _draw_belief(self, draw: ImageDraw.ImageDraw, sketch: list[Floats]) -> None:
@@ -130,7 +133,7 @@ class Pictures:
             draw.line([tuple(end) for end in ends], fill=colour, width=3)
 
     def _draw_slots(
-        self, draw: ImageDraw.ImageDraw, device: int, k: int, top: int, bottom: int
+        self, draw: ImageDraw.ImageDraw, shot: Film, device: int, k: int, top: int, bottom: int
     ) -> None:
         """Draw the last slots, one column each, the newest at the right."""
         draw.rectangle([0, top, PANEL_PX[0] - 1, bottom], fill=(228, 228, 228))
@@ -138,7 +141,9 @@ class Pictures:
         for slot, arrived in enumerate(self.link.delivered[first : k + 1, device], start=first):
             column = PANEL_PX[0] - 1 - (k - slot)
             if arrived:
-                draw.rectangle([column - 1, top, column, bottom], fill=ARRIVED)
+                strange = shot.flagged is not None and shot.flagged[slot, device]
+                colour = FLAGGED if strange else ARRIVED
+                draw.rectangle([column - 1, top, column, bottom], fill=colour)
             elif self.link.sends_always:
                 draw.line([(column, bottom - 2), (column, bottom)], fill=LOST)
 
@@ -203,7 +208,7 @@ def _gif_ms(fps: int) -> int:
 
 def _palette(picture: Image.Image) -> Image.Image:
     """Return the commonest colours of a picture, and those of the strips however rare."""
-    kept = (*ARRIVED, *LOST)
+    kept = (*ARRIVED, *LOST, *FLAGGED)
     common = picture.quantize(COLOURS - len(kept) // 3).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*common[: 3 * COLOURS - len(kept)], *kept])

@@ -32,6 +32,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike
 
+from hjepa_cli.core.plants.stress import CONDITIONS
 from hjepa_cli.core.style import PLAIN, Style
 from hjepa_cli.errors import UsageError
 from hjepa_cli.plugins import LAWS, METHODS, SCHEDULERS
@@ -65,6 +66,8 @@ LINES = (  # of a training, whose losses are drawn like these
     *("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero", "oracle", "hold-true", "zero-true"),
     *("ts-jepa-2", "ts-jepa-3", "ts-jepa-5", "supervised-2", "supervised-4", "autoencoder-2"),
 )
+STRESS_COLUMNS = 6  # panels beside each other
+GAP_STYLES = [Style("#0072B2", "o"), Style("#D55E00", "s", "--"), Style("#009E73", "^", "-.")]
 LONGEST_OF_THREE = 15  # characters of a label, for three columns of a legend
 
 
@@ -412,6 +415,66 @@ def _finish(figure: Figure, axes: Axes) -> None:
         longest = max(len(label) for label in axes.get_legend_handles_labels()[1])
         ncols = 3 if longest <= LONGEST_OF_THREE else 2
         figure.legend(loc="outside lower center", ncols=ncols)
+
+
+@matplotlib.rc_context(RC)
+def stress_figure(stress: Mapping[str, Any], *, title: str = "") -> Figure:
+    """Draw ``stress`` of ``eval --json``: score ÷ nominal score against severity, by condition.
+
+    There is a line for each gap of the only method, or for each method at the middle gap; and a
+    panel for each condition, the last one for conditions that are composed of several.
+    """
+    methods, gaps = list(stress["methods"]), stress["gaps"]
+    lines = [(methods[0], number) for number in range(len(gaps))]
+    if len(methods) > 1:
+        lines = [(method, len(gaps) // 2) for method in methods]
+    panels: dict[str, list[tuple[str, int]]] = {}
+    for place, text in enumerate(stress["conditions"]):
+        name, _, severity = text.partition("=")
+        alone = "+" not in text
+        panels.setdefault(name if alone else "", []).append((severity if alone else text, place))
+    panels = dict(sorted(panels.items(), key=lambda item: not item[0]))
+    columns = min(len(panels), STRESS_COLUMNS)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(TWO_COLUMNS_IN[0], 0.9 + 1.35 * rows), layout="constrained")
+    figure.suptitle(title, fontsize=RC["axes.titlesize"])
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes in grid.flat[len(panels) :]:
+        axes.remove()
+    for axes, (name, severities) in zip(grid.flat, panels.items(), strict=False):
+        nominal = CONDITIONS[name].nominal if name in CONDITIONS else None
+        for line, (method, gap) in enumerate(lines):
+            style = method_style(method, methods) if len(methods) > 1 else GAP_STYLES[line % 3]
+            entry = stress["methods"][method]
+            points = [(place, entry["rows"][place]["points"][gap]) for _, place in severities]
+            where = [float(at) for at, _ in severities] if name else [*range(len(severities))]
+            marks = [
+                (at, point["relative"], *(point["relative_ci95"] or (None, None)))
+                for at, (_, point) in zip(where, points, strict=True)
+            ]
+            marks = sorted(mark for mark in marks if mark[1] is not None)
+            if name and nominal is not None and nominal <= CONDITIONS[name].high:
+                marks = sorted([*marks, (nominal, 1.0, 1.0, 1.0)])
+            label = f"{method}, " * (len(methods) > 1) + f"D = {gaps[gap]}"
+            if marks:
+                at, value, low, high = np.array(marks, float).T
+                if not name:
+                    at = at + 0.15 * (line - (len(lines) - 1) / 2)
+                looks = {"linestyle": style.line if name else "none", "linewidth": 0.9}
+                draw_bars(axes, style, at, value, low, high, label=label, **looks)
+        axes.axhline(1, color="black", linewidth=0.5)
+        axes.set_ylim(0, 1.15)
+        axes.set_title(name.replace("_", " ") or "several together", fontsize=7)
+        axes.tick_params(labelsize=6)
+        if not name:
+            axes.set_xlim(-0.5, len(severities) - 0.5)
+            axes.set_xticks(range(len(severities)), [text for text, _ in severities], rotation=20)
+        axes.grid(visible=True)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("÷ nominal", fontsize=7)
+    handles = dict(zip(*reversed(grid.flat[0].get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=7)
+    return figure
 
 
 @matplotlib.rc_context(RC)

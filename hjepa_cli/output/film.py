@@ -52,3 +52,4 @@ class Film:
     states: Floats  # true [K, n, S]
     believed: Floats  # read from the controller's embedding [K, n, S]
     score: Bools  # whether each step was inside the band [K, n]
+    flagged: Bools | None = None  # which packets looked like nothing in training [K, n]

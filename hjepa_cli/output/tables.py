@@ -6,7 +6,7 @@ from typing import Any
 from hjepa_cli.core.control.force_error import WINDOWS
 from hjepa_cli.core.control.link import described
 from hjepa_cli.core.evaluation.protocol import BESIDE
-from hjepa_cli.output.screen import Screen, described_steps, tolerance
+from hjepa_cli.output.screen import Screen, described_steps, span, tolerance
 
 
 def measured(value: float | None) -> str:
@@ -113,6 +113,11 @@ def show_evaluation(result: dict[str, Any], screen: Screen) -> None:
         ["method", *(f"{point['d']:g}" for point in first["gap_curve"])],
         scores,
     )
+    for name, entry in entries.items():
+        flagged = [point["flagged"] for point in entry["gap_curve"] if "flagged" in point]
+        if flagged:
+            shares = ", ".join(f"{share:.1%}" for share in flagged)
+            screen.say(f"{name}: packets flagged, by gap: {shares}")
     for name, path in result.get("checkpoints", {}).items():
         if path != result["checkpoint"]:
             screen.say(f"{name} is of model {path}")
@@ -141,6 +146,12 @@ def show_offline(result: dict[str, Any], screen: Screen) -> None:
             for name, entry in entries.items()
         ],
     )
+    for name in entries if result.get("conditions") else ():
+        screen.table(
+            f"{where}: NMAE of {name} under conditions, and with every packet ÷ without any",
+            offline_columns(entries),
+            offline_rows(result, name),
+        )
     rows = []
     for name, of in result["latent"].items():
         last = len(of["steps"]) - 1
@@ -170,6 +181,67 @@ def show_offline(result: dict[str, Any], screen: Screen) -> None:
         "recordings say nothing of closed loops; hjepa scale --tolerance-steps STEPS counts the "
         "devices of a gap that you take to be safe"
     )
+
+
+def offline_columns(entries: Mapping[str, Any]) -> list[str]:
+    """Return the headings of :func:`offline_rows`."""
+    first = next(iter(entries.values()))
+    within = (f"≤ {most}" for most in first["steps_within"])
+    return ["condition", *first["nmae_windows"], "every", "÷ nominal", *within]
+
+
+def offline_rows(result: Mapping[str, Any], name: str) -> list[list[str | None]]:
+    """Return what recordings say of a method under conditions, by rows, the nominal first."""
+    nominal = result["methods"][name]
+    rows = [(row["condition"], row["methods"][name]) for row in result["conditions"]]
+    usual = nominal["nmae_every_step"]
+    return [
+        [
+            condition,
+            *(_number(value, 4) for value in entry["nmae_windows"].values()),
+            _number(entry["nmae_every_step"], 4),
+            _number(entry["nmae_every_step"] / usual if usual else None, 2),
+            *(str(steps) for steps in entry["steps_within"].values()),
+        ]
+        for condition, entry in (("nominal", nominal), *rows)
+    ]
+
+
+def show_stress(result: dict[str, Any], screen: Screen) -> None:
+    """Print a table per method: scores under conditions, with their share of the nominal ones."""
+    stress = result["stress"]
+    for name, entry in stress["methods"].items():
+        screen.table(
+            f"{result['plant']}, seed {result['seed']}: score of {name} by gap D between packets "
+            f"({stress['n_devices']} devices, {described_steps(stress)}, 95 % CI), and ÷ its "
+            "nominal score",
+            stress_columns(stress, entry),
+            stress_rows(entry),
+        )
+
+
+def stress_columns(stress: dict[str, Any], entry: dict[str, Any]) -> list[str]:
+    """Return the headings of :func:`stress_rows`."""
+    gaps = stress["gaps"]
+    flagged = ["flagged"] * ("flagged" in entry["nominal"][0])
+    shares = (f"÷ nominal, {gap}" for gap in gaps)
+    return ["condition", *(f"D = {gap}" for gap in gaps), *shares, *flagged]
+
+
+def stress_rows(entry: dict[str, Any]) -> list[list[str | None]]:
+    """Return the rows of a method's table, the nominal first, the mean of the others last."""
+    rows = [("nominal", entry["nominal"])]
+    rows += [(row["condition"], row["points"]) for row in entry["rows"]]
+    rows += [("mean of these", entry["means"])] if len(entry["rows"]) > 1 else []
+    return [
+        [
+            name,
+            *(span(point["score"], point["ci95"], 2) for point in points),
+            *(_number(point["relative"], 2) for point in points),
+            *([_number(points[0].get("flagged"), 3)] if "flagged" in entry["nominal"][0] else []),
+        ]
+        for name, points in rows
+    ]
 
 
 def _number(value: float | None, decimals: int) -> str | None:

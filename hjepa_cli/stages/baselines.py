@@ -19,7 +19,7 @@ from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
-from hjepa_cli.stages.frame_training import fit
+from hjepa_cli.stages.frame_training import fit, recorded
 from hjepa_cli.stages.inputs import embed, pictures
 from hjepa_cli.stages.training import TrainingRun
 
@@ -30,10 +30,9 @@ LOOK_FRAMES = 500  # of them, for the reconstruction error
 def describe_architecture(settings: Settings) -> dict[str, Any]:
     """Return the architecture of a baseline, as it goes into the checkpoint."""
     encoder, actor = settings.encoder, settings.actor
-    recorded = ("frames", "embedding", "frame_input", "centre", "mirror")
     return {
         "kind": encoder.method,
-        **{name: getattr(encoder, name) for name in recorded},
+        **recorded(encoder, "frames", "embedding", "frame_input", "centre", "mirror"),
         "actor_hidden": actor.hidden,
         "actor_dropout": actor.dropout,
         **pictures(settings),
@@ -44,14 +43,15 @@ def train(
     networks: nn.ModuleDict, run: TrainingRun, train: RenderedSplit, test: RenderedSplit
 ) -> dict[str, Any]:
     """Train a baseline in place; return its held-out health."""
-    device, frames = resolve_device(run.settings.device), run.settings.encoder.frames
-    _standardise(networks, standardisation_sample(train.frames, frames_each=frames))
-    look = functools.partial(_look, networks, test, run.settings)
+    device, options = resolve_device(run.settings.device), run.settings.encoder
+    look = {"frames_each": options.frames, "frame_gap": options.frame_gap}
+    _standardise(networks, standardisation_sample(train.frames, **look))
+    watch = functools.partial(_look, networks, test, run.settings)
     trained: tuple[str, ...] = ("encoder", "actor")
     if "decoder" in networks:
-        fit(run, train, "autoencoder", Reconstruction(networks, device), look)
+        fit(run, train, "autoencoder", Reconstruction(networks, device), watch)
         trained = ("reader", "actor")
-    fit(run, train, "actor", Imitation(networks, trained, device), look)
+    fit(run, train, "actor", Imitation(networks, trained, device), watch)
     networks.eval()
     run.screen.say("measuring health on all frames")
     return examine(networks, train, test, run.settings)
@@ -103,8 +103,9 @@ def _read(
     networks: nn.ModuleDict, split: RenderedSplit, settings: Settings, *, every: int
 ) -> torch.Tensor:
     """Return what the actor listens to in every ``every``-th step: embeddings [N · K, D]."""
-    read, frames = functools.partial(read_frames, networks), settings.encoder.frames
-    return embed(read, split, settings, every=every, frames=frames).flatten(0, 1)
+    read, options = functools.partial(read_frames, networks), settings.encoder
+    look = options.frames, options.frame_gap
+    return embed(read, split, settings, every=every, look=look).flatten(0, 1)
 
 
 @torch.inference_mode()
@@ -122,7 +123,8 @@ def _reconstruction_error(
     networks: nn.ModuleDict, split: RenderedSplit, settings: Settings
 ) -> float:
     """Return mean squared error ÷ variance of a channel, of evenly spaced frames."""
-    seen = split.seen(LOOK_EVERY, frames=settings.encoder.frames)
+    options = settings.encoder
+    seen = split.seen(LOOK_EVERY, frames=options.frames, frame_gap=options.frame_gap)
     device = resolve_device(settings.device)
     objective = Reconstruction(networks, device)
     chosen = seen[:: max(len(seen) // LOOK_FRAMES, 1)]

@@ -32,7 +32,7 @@ from hjepa_cli.core.control.drivers import planner_of
 from hjepa_cli.core.control.loop import Draws, LinkDraws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
-from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_back, frames_of
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.core.statistics import bootstrap_weights, mean_interval
@@ -321,8 +321,10 @@ def simulated(
     level, another code, and two loops that have little to do with each other.
     """
 
+    back = frames_back(*runtime.bundle.look)
+
     def sense(seen: Floats) -> torch.Tensor:
-        frames = frames_of(camera, seen[:, -runtime.bundle.frames :])
+        frames = frames_of(camera, seen[:, back])
         coded = (protocol.encode_int8(runtime.encode(one[None])[0]) for one in frames)
         received: list[NDArray[np.float32]] = [protocol.decode_int8(*pair) for pair in coded]
         return torch.from_numpy(np.stack(received))

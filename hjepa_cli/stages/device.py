@@ -81,7 +81,7 @@ def run(
             return plants[0]
 
         opened_camera = open_camera(camera, parse_crop(crop), simulated)
-        watched = things.enter_context(contextlib.closing(Watched(opened_camera, bundle.frames)))
+        watched = things.enter_context(contextlib.closing(Watched(opened_camera, *bundle.look)))
         hands = actuator or ("sim" if plants else "none")
         if hands == "sim" and not plants:
             raise UsageError("--actuator sim needs --camera sim: the plant that is seen is pushed")

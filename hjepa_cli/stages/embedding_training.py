@@ -20,6 +20,7 @@ from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks.model import Model, tensors_of
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant_of
+from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, fit_actor
 from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
@@ -29,6 +30,7 @@ from hjepa_cli.stages.training import Architecture, Drawn, TrainingRun, untraine
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 
 STREAM = 3  # of the shifts, and of train-hierarchy, in the seed tree
+AUGMENTED = 9  # of STREAM; its levels have 1 to 4
 REPORT_EVERY = 50  # steps between rows of metrics.csv
 
 
@@ -66,39 +68,73 @@ def embed_all(
     """Return embeddings and labels [N, T, *A] of the training pictures and of shifted copies.
 
     In a copy every trajectory is moved sideways by up to ``encoder.shift_px``, and the labels are
-    what the teacher does there. With ``flip`` all of these are there in the mirror too.
+    what the teacher does there. With ``flip`` all of these are there in the mirror too. Copies of
+    these that are augmented come last, with the labels and the embeddings of clean ones.
     """
     device, kind, count = resolve_device(settings.device), plant_of(settings), len(train.frames)
     act, mirror = control_law(kind, settings.control), torch.tensor(kind.mirror)
     teach = labels_of(train, kind, act)
     every = torch.arange(count)[:, None], torch.arange(train.states.shape[1])[None]
     views = []
-    for mirrored, shifts_px in views_of(settings, count, flip=flip):
-        side = mirror if mirrored else torch.ones_like(mirror)
-        # A mirror image moved right is that of a picture moved left.
-        labels = side * teach(*every, (-shifts_px if mirrored else shifts_px)[:, None])
-        views.append((mirrored, shifts_px, side * train.actions, labels))
-    seen = []
+    for view in views_of(settings, count, flip=flip):
+        side = mirror if view.mirrored else torch.ones_like(mirror)
+        labels = side * teach(*every, view.before_px[:, None])
+        views.append((view, side * train.actions, labels))
+    seen: list[tuple[EmbeddedTrajectories, Tensor]] = []
     with screen.progress("encode", len(views) * count, "trajectories") as bar:
-        for mirrored, shifts_px, actions, labels in views:
-            moved_px = shifts_px if shifts_px.any() else None
+        for view, actions, labels in views:
             z = embed(
-                encoder, train, settings, mirrored=mirrored, shifts_px=moved_px, advance=bar.advance
+                *(encoder, train, settings),
+                mirrored=view.mirrored,
+                shifts_px=view.shifts_px if view.shifts_px.any() else None,
+                seeds=view.seeds,
+                advance=bar.advance,
             )
-            seen.append((EmbeddedTrajectories(z.to(device), actions.to(device)), labels))
+            clean = None if view.seeds is None else seen[view.of][0].z
+            embedded = EmbeddedTrajectories(z.to(device), actions.to(device), clean)
+            seen.append((embedded, labels))
     return seen
 
 
-def views_of(settings: Settings, count: int, *, flip: bool) -> list[tuple[bool, NDArray[np.int64]]]:
-    """Return the views of trajectories in training: as they are, shifted, and all in the mirror.
+@dataclasses.dataclass(frozen=True)
+class View:
+    """All trajectories in training are seen once more like this.
 
-    Each says whether it is mirrored, and how far right its ``count`` trajectories are [N], px.
+    Attributes:
+        mirrored: whether in the mirror.
+        shifts_px: how far right each trajectory is [N].
+        seeds: of the augmentation of each [N]; ``None`` where it is clean.
+        of: the number of the clean view that it is an augmented copy of.
+    """
+
+    mirrored: bool
+    shifts_px: NDArray[np.int64]
+    seeds: list[int] | None = None
+    of: int = 0
+
+    @property
+    def before_px(self) -> NDArray[np.int64]:
+        """Return how far right the trajectories were before the mirror [N]."""
+        # A mirror image moved right is that of a picture moved left.
+        return -self.shifts_px if self.mirrored else self.shifts_px
+
+
+def views_of(settings: Settings, count: int, *, flip: bool) -> list[View]:
+    """Return the views of ``count`` trajectories in training.
+
+    They are as they are, shifted, all of these in the mirror, and augmented copies of these.
     """
     farthest = settings.encoder.shift_px
     copies = settings.hierarchy.shifted_copies if farthest else 0
     drawn = generator(settings.seed, STREAM, 0).integers(-farthest, farthest + 1, (copies, count))
     shifts = (np.zeros(count, dtype=np.int64), *drawn)
-    return [(mirrored, moved) for mirrored in (False, True)[: 1 + flip] for moved in shifts]
+    clean = [View(mirrored, moved) for mirrored in (False, True)[: 1 + flip] for moved in shifts]
+    augment, stream = Augmentation(settings.augment), generator(settings.seed, STREAM, AUGMENTED)
+    copies = (settings.augment.copies if augment.on else 0) * (1 + flip)
+    sources = [copy * len(clean) // copies for copy in range(copies)]
+    return clean + [
+        dataclasses.replace(clean[of], seeds=augment.draw(count, stream), of=of) for of in sources
+    ]
 
 
 def fit_network(

@@ -9,16 +9,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.config.checks import check_gaps, check_methods
+from hjepa_cli.config.checks import check_gaps, check_methods, needs_model
 from hjepa_cli.config.schema import RECORDED, Settings
+from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen, in_order
-from hjepa_cli.output.tables import show_evaluation
+from hjepa_cli.output.tables import show_evaluation, show_stress
 from hjepa_cli.stages import evaluate_offline, results
 from hjepa_cli.stages.measuring import curves_for, plan_curves
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory
+from hjepa_cli.stages.stressing import measure_stress, plan_stress, rows_of
 from hjepa_cli.storage.runs import Run
 
 
@@ -42,10 +44,11 @@ def run(
         out: run directory; an interrupted one is continued after the last finished method.
         remeasure: do not use cached curves.
         further: models of methods that the first one does not hold; ``None`` looks for them.
-        figure: draw the paper's Fig. 3 into the run's directory.
+        figure: draw the paper's Fig. 3, or scores under ``settings.stress``, into the run's
+            directory.
 
     Raises:
-        UsageError: unknown method.
+        UsageError: unknown method or condition.
         MissingInputError: no such checkpoint or dataset, no model of any of the methods, or no
             matplotlib for ``figure``.
         DataError: a damaged file, one of another plant, or a figure of models of different seeds.
@@ -59,13 +62,21 @@ def run(
     with Run.create("eval", out, settings.as_dict(), inputs) as record:
         result = recorded = record.result
         if result is None:
-            result = record.finish(curves_for(models, screen, record, remeasure=remeasure))
+            if settings.stress:
+                result = record.finish(stress_for(models, screen, record))
+            else:
+                result = record.finish(curves_for(models, screen, record, remeasure=remeasure))
         with results.showing("eval", recorded, record.directory):
             if recorded is not None:
                 screen.say(f"{record.directory} is finished; this is its result")
                 for key in ("methods", "checkpoints"):  # stored in the order of the alphabet
                     result[key] = in_order(result.get(key, {}), settings.methods)
+                if "stress" in result:
+                    of = result["stress"]["methods"]
+                    result["stress"]["methods"] = in_order(of, settings.methods)
             show_evaluation(result, screen)
+            if "stress" in result:
+                show_stress(result, screen)
             if figure:
                 result["figures"] = draw(result, settings, record.directory, screen)
         return result
@@ -90,6 +101,8 @@ def plan(
     models = open_measurable(settings, quiet, checkpoint, dataset, further, figure=figure)
     measured = models.measurable(settings.methods)
     work, seconds = plan_curves(models, measured, remeasure=remeasure)
+    if settings.stress:
+        work, seconds = plan_stress(models)
     return Plan(
         command="eval",
         reads=reads_of(models),
@@ -129,11 +142,14 @@ def open_measurable(
     """Open what :func:`run` evaluates, and refuse what cannot be before anything is written."""
     check_methods(settings.methods)
     check_gaps(settings.protocol)
+    actual_camera(settings)
+    rows_of(settings)
     if figure and find_spec("matplotlib") is None:
         raise MissingInputError(
             "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
         )
     models = open_model_set(settings, screen, checkpoint, dataset, further, one_seed=figure)
+    rows_of(models.settings)  # of its pictures, which may be grey
     skipped = models.skipped(settings.methods)
     if len(skipped) == len(settings.methods):
         raise MissingInputError(
@@ -146,17 +162,38 @@ def open_measurable(
     return models
 
 
-def draw(result: dict[str, Any], settings: Settings, directory: Path, screen: Screen) -> list[Path]:
-    """Write the paper's Fig. 3 as ``comparison.png``, ``.svg`` and ``.pdf``."""
-    from hjepa_cli.output.figures import comparison_figure, save
+def stress_for(models: ModelSet, screen: Screen, record: Run) -> dict[str, Any]:
+    """Measure what ``--stress`` asks for; return the document of ``--json``."""
+    settings = models.settings
+    methods = models.measurable(settings.methods)
+    paths = {name: models.of(name).path for name in methods if needs_model(name)}
+    return {
+        "checkpoint": models.path,
+        "checkpoints": {name: path for name, path in paths.items() if path},
+        "training_seeds": models.training_seeds(methods),
+        "plant": settings.plant,
+        "seed": settings.seed,
+        "methods": {},
+        "skipped": models.skipped(settings.methods),
+        "stress": measure_stress(models, screen, record),
+    }
 
-    drawn = comparison_figure(
-        result["methods"],
-        acceptable_score=result["acceptable_score"],
-        step_s=plant(settings.plant).step_s,
-        title=f"{result['plant']}, seed {result['seed']}, 95 % CI",
-    )
-    paths = [save(drawn, directory / f"comparison.{kind}") for kind in ("png", "svg", "pdf")]
+
+def draw(result: dict[str, Any], settings: Settings, directory: Path, screen: Screen) -> list[Path]:
+    """Write the paper's Fig. 3, or scores under stress, as ``.png``, ``.svg`` and ``.pdf``."""
+    from hjepa_cli.output.figures import comparison_figure, save, stress_figure
+
+    name, title = "comparison", f"{result['plant']}, seed {result['seed']}, 95 % CI"
+    if "stress" in result:
+        name, drawn = "stress", stress_figure(result["stress"], title=title)
+    else:
+        drawn = comparison_figure(
+            result["methods"],
+            acceptable_score=result["acceptable_score"],
+            step_s=plant(settings.plant).step_s,
+            title=title,
+        )
+    paths = [save(drawn, directory / f"{name}.{kind}") for kind in ("png", "svg", "pdf")]
     screen.say(f"written: {', '.join(map(str, paths))}")
     return paths
 

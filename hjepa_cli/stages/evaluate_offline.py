@@ -1,8 +1,8 @@
 """``hjepa eval --dataset D`` of recordings measures what needs no simulator.
 
 Held-out recordings and trained models → how forces err after a packet, how embeddings are predicted
-under the recorded actions, and what states can be read off them. Pictures are an argument of
-:func:`measured`: what changes them, to see what a model stands, comes in there.
+under the recorded actions, and what states can be read off them. With ``--stress`` forces are
+measured once more under every condition of pictures.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,6 +17,7 @@ from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.datasets.dataset import Dataset, Trajectories
 from hjepa_cli.core.evaluation import offline
 from hjepa_cli.core.networks import health
+from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.screen import Screen, in_order
 from hjepa_cli.output.tables import show_offline
@@ -25,6 +26,7 @@ from hjepa_cli.stages import results
 from hjepa_cli.stages.inputs import brought_along, open_dataset
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
+from hjepa_cli.stages.stressing import rows_of
 from hjepa_cli.storage.runs import Run
 
 NEEDS_STATES = "it asks for a plant's states or equations, and recordings have none"
@@ -50,13 +52,15 @@ def run(
         if result is None:
             recorded = data.split(data.rollouts)
             assert recorded.frames is not None
-            with screen.progress("eval", len(methods_of(models)), "methods") as bar:
+            units = len(methods_of(models)) * (1 + len(rows_of(models.settings)))
+            with screen.progress("eval", units, "methods") as bar:
                 result = measured(models, data, recorded, advance=bar.advance)
             result = record.finish(result)
         with results.showing("eval", kept, record.directory):
             if kept is not None:
                 screen.say(f"{record.directory} is finished; this is its result")
-                result["methods"] = in_order(result["methods"], settings.methods)
+                for one in (result, *result.get("conditions", [])):
+                    one["methods"] = in_order(one["methods"], settings.methods)
             show_offline(result, screen)
         return result
 
@@ -73,13 +77,16 @@ def plan(
     quiet = Screen(quiet=True)
     data, models = open_recorded(settings, quiet, checkpoint, dataset, further)
     split, methods = data.splits[data.rollouts], methods_of(models)
-    frames = len(methods) * split["trajectories"] * (split["steps"] + 1)
+    rows = rows_of(models.settings)
+    frames = (1 + len(rows)) * len(methods) * split["trajectories"] * (split["steps"] + 1)
     return Plan(
         command="eval",
         reads=[f"model {models.name}", f"dataset {data.path}"],
         work=[
             f"leave {', '.join(methods)} alone after one packet on {split['trajectories']} "
             f"recorded trajectories of split {data.rollouts}"
+            + f", and under {len(rows)} conditions"
+            * bool(rows)
         ],
         writes=[f"run {run_directory('eval', out)}"],
         writes_bytes=50_000,
@@ -98,11 +105,19 @@ def open_recorded(
 
     Raises:
         MissingInputError: no dataset, or no model of any of the methods.
+        UsageError: conditions that are not of these pictures.
         As :func:`~.model_set.open_model_set`.
     """
     check_methods(settings.methods)
+    if settings.protocol.false_alarm:
+        raise UsageError(
+            "--false-alarm is calibrated on simulated pictures; of a recorded plant there are none",
+            key="protocol.false_alarm",
+        )
     data = open_dataset(dataset, settings)
     settings = brought_along(settings, data.settings, data.path)
+    actual_camera(settings)
+    rows_of(settings)
     models = open_model_set(settings, screen, checkpoint, data.path, further)
     for name, reason in skipped(models).items():
         screen.say(f"{name} skipped: {reason}")
@@ -136,13 +151,13 @@ def skipped(models: ModelSet) -> dict[str, str]:
 def measured(
     models: ModelSet, data: Dataset, recorded: Trajectories, *, advance: Any = lambda count: None
 ) -> dict[str, Any]:
-    """Measure all methods on recorded trajectories with their pictures.
+    """Measure all methods on recorded trajectories with their pictures, under all conditions.
 
     Args:
         models: what is evaluated, with settings.
         data: the dataset, for the training half of probes.
         recorded: the trajectories.
-        advance: is told of each method that is done.
+        advance: is told of each method that is done, without a condition or under one.
 
     Raises:
         UsageError: trajectories that are too short.
@@ -154,7 +169,7 @@ def measured(
         raise UsageError(f"recorded trajectories of {recorded.steps} steps have no horizon")
     actions, expert = (values.astype(float) for values in (recorded.applied_n, recorded.teacher_n))
     windows = offline.Recorded.cut(recorded.frames, actions, expert, horizon)
-    bootstrap = protocol.bootstrap, seed
+    bootstrap, camera = (protocol.bootstrap, seed), actual_camera(settings)
     methods: dict[str, Any] = {}
     latent: dict[str, Any] = {}
     z_of: dict[str, Any] = {}
@@ -164,10 +179,18 @@ def measured(
         methods[name] = offline.entry_of(build_driver(name, settings, model), windows, *bootstrap)
         if planner := METHODS[name].planner:
             if model.digest not in z_of:
-                z_of[model.digest] = offline.embedded(model, windows.frames)
+                z_of[model.digest] = offline.embedded(model, windows.frames, camera)
             z = z_of[model.digest]
             latent[name] = offline.latent_errors(planner(model), z, windows, *bootstrap)
         advance(1)
+    under = []
+    for text, row in rows_of(settings).items():
+        found = {}
+        for name in methods:
+            driver = build_driver(name, row, models.of(name).model)
+            found[name] = offline.entry_of(driver, windows, *bootstrap)
+            advance(1)
+        under.append({"condition": text, "methods": found})
     return {
         "offline": True,
         "checkpoint": models.path,
@@ -184,6 +207,7 @@ def measured(
         "latent": latent,
         "probe_r2": probes(models, data),
         "skipped": skipped(models),
+        **({"conditions": under} if under else {}),
     }
 
 
@@ -192,10 +216,10 @@ def probes(models: ModelSet, data: Dataset) -> Mapping[str, float | None]:
     model, names = models.model, data.kind.state_names
     if not names or model is None:
         return {}
-    read = []
-    for split in ("train", "test"):
+    read, cameras = [], {"train": model.camera, "test": actual_camera(models.settings)}
+    for split, camera in cameras.items():
         of = data.split(split)
         assert of.frames is not None
-        read += [offline.embedded(model, of.frames).flatten(0, 1)]
+        read += [offline.embedded(model, of.frames, camera).flatten(0, 1)]
         read += [torch.from_numpy(of.states[:, 1:].reshape(-1, len(names)))]
     return health.probe_r2(*read, names)

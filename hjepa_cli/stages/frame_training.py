@@ -1,13 +1,18 @@
 """All methods of ``train-encoder`` share the loop that trains on camera frames."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
 
+from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
+from hjepa_cli.config.schema import EncoderSettings
+from hjepa_cli.core.networks.model import UNSAID
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant_of
+from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import FrameWindows
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.core.training.jepa import Jepa
@@ -16,6 +21,12 @@ from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
 from hjepa_cli.stages.training import Drawn, TrainingRun
 
 STREAM = 2  # this stage's branch of the seed tree
+
+
+def recorded(encoder: EncoderSettings, *names: str) -> dict[str, Any]:
+    """Return the settings that an architecture records: those named, and others unless usual."""
+    values = {name: getattr(encoder, name) for name in (*names, *UNSAID)}
+    return {name: v for name, v in values.items() if name in names or v != UNSAID[name]}
 
 
 def fit(
@@ -27,7 +38,8 @@ def fit(
 ) -> None:
     """Train for ``encoder.steps`` steps, all phases on the same windows.
 
-    Every batch is ``batch_trajectories`` windows of ``batch_frames`` frames, h steps apart. Every
+    Every batch is ``batch_trajectories`` windows of ``batch_frames`` frames, h steps apart, which
+    networks see augmented, if the settings say so. Every
     epoch ``look`` is called with the loss terms and returns a row of ``metrics.csv``.
 
     Raises:
@@ -55,9 +67,11 @@ def fit(
         mirrored_actions=kind.mirror,
         labels=labels_of(train, kind, control_law(kind, run.settings.control)),
         frames_each=options.frames,
+        frame_gap=options.frame_gap,
     )
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories
-    share = ranks.share(count)
+    share, device = ranks.share(count), resolve_device(run.settings.device)
+    augment = Augmentation(run.settings.augment)
     part = (share.stop - share.start) / count  # 1 on a single process
     epoch_steps = max(train.actions.shape[:2].numel() // (count * windows.window_frames), 1)
     terms: dict[str, Tensor] = {}
@@ -65,6 +79,9 @@ def fit(
     def draw() -> Drawn:
         objective.train()
         batch = windows.draw(count, stream, share)
+        if seeds := augment.draw(count, stream):
+            worse = augment(batch.frames.to(device), seeds[share])
+            batch = dataclasses.replace(batch, worse=worse)
         losses = objective.losses(batch)
         terms.update({name: part * term for name, term in losses.items()})
         return objective.total(terms), lambda: batch.drawn

@@ -18,6 +18,12 @@ from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant, plant_in
 from hjepa_cli.errors import MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
+from hjepa_cli.output.tables import (
+    offline_columns,
+    offline_rows,
+    stress_columns,
+    stress_rows,
+)
 from hjepa_cli.stages import results
 from hjepa_cli.storage import files, runs
 
@@ -127,7 +133,9 @@ def page_template() -> Template:
         "sprintf": lambda value, text: text % value,
     }
     named = (gates, in_order, ranked, span, tolerance, windows)
-    environment.globals |= {one.__name__: one for one in named} | {"version": __version__}
+    tables = (offline_columns, offline_rows, stress_columns, stress_rows)
+    environment.globals |= {one.__name__: one for one in (*named, *tables)}
+    environment.globals["version"] = __version__
     return environment.get_template("report.html.j2")
 
 
@@ -240,6 +248,9 @@ def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path
     """Draw score against gap and delivery, error against the horizon; none that would be empty."""
     from hjepa_cli.output import figures
 
+    if "stress" in result:
+        caption = "Score ÷ nominal score against the severity of each condition, 95 % bands"
+        return {"stress": (caption, figures.stress_figure(result["stress"]))}
     entries = in_order(result["methods"], config["methods"])
     if result.get("offline"):
         text = "Error of the predicted force after a single packet, on recordings, 95 % bands"

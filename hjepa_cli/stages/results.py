@@ -103,6 +103,36 @@ class _Fusion(_Trained):
     distances: dict[str, Number]
 
 
+class _StressPoint(msgspec.Struct):
+    score: Number
+    ci95: tuple[Number, Number]
+    relative: Number | None
+    relative_ci95: tuple[Number, Number] | None
+    flagged: Number | None = None
+
+
+class _StressRow(msgspec.Struct):
+    condition: str
+    points: list[_StressPoint]
+
+
+class _StressEntry(msgspec.Struct):
+    nominal: Annotated[list[_StressPoint], Meta(min_length=1)]
+    rows: list[_StressRow]
+    means: list[_StressPoint]
+
+
+class _Stress(msgspec.Struct):
+    """What ``eval --stress`` says of a simulated plant."""
+
+    gaps: Annotated[list[Whole], Meta(min_length=1)]
+    conditions: list[str]
+    n_devices: Whole
+    warmup_steps: Whole
+    scored_steps: Whole
+    methods: dict[str, _StressEntry]
+
+
 class _Evaluation(msgspec.Struct):
     plant: str
     seed: Whole
@@ -112,6 +142,7 @@ class _Evaluation(msgspec.Struct):
     acceptable_score: Number = 0.0
     acceptable_lq_ratio: Number = 0.0
     source: str = ""
+    stress: _Stress | None = None
 
 
 class _OfflineEntry(msgspec.Struct):
@@ -122,6 +153,11 @@ class _OfflineEntry(msgspec.Struct):
     nmae_every_step: NotNegative | None
     steps_within: dict[str, Whole]
     bits_per_transmission: NotNegative
+
+
+class _OfflineRow(msgspec.Struct):
+    condition: str
+    methods: dict[str, _OfflineEntry]
 
 
 class _Latent(msgspec.Struct):
@@ -142,6 +178,7 @@ class _Offline(msgspec.Struct):
     methods: Annotated[dict[str, _OfflineEntry], Meta(min_length=1)]
     latent: dict[str, _Latent]
     probe_r2: Windows
+    conditions: list[_OfflineRow] = []
 
 
 class _Scale(msgspec.Struct):
@@ -301,6 +338,8 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     if offline:
         return _offline_flaw(result)
     if stage == "eval":
+        if reason := _stress_flaw(result.get("stress")):
+            return reason
         entries = result["methods"]
         former = {"tolerance_gap_lq_steps": None}  # which older ones lack
         flaws = ((name, curves.flaw(former | entry)) for name, entry in entries.items())
@@ -320,6 +359,19 @@ def _flaw(stage: str, result: Mapping[str, Any]) -> str | None:
     return None
 
 
+def _stress_flaw(stress: Mapping[str, Any] | None) -> str | None:
+    """Return what keeps scores under conditions from being shown, if anything."""
+    if stress is None:
+        return None
+    for name, entry in stress["methods"].items():
+        if [row["condition"] for row in entry["rows"]] != stress["conditions"]:
+            return f"stress of '{name}': its rows are not the conditions"
+        rows = [entry["nominal"], *(row["points"] for row in entry["rows"]), entry["means"]]
+        if any(len(row) != len(stress["gaps"]) for row in rows if row is not entry["means"] or row):
+            return f"stress of '{name}': a row has not one point for each gap"
+    return None
+
+
 def _offline_flaw(result: Mapping[str, Any]) -> str | None:
     """Return what keeps an evaluation on recordings from being shown, if anything."""
     entries = result["methods"]
@@ -329,8 +381,13 @@ def _offline_flaw(result: Mapping[str, Any]) -> str | None:
     for name, of in result["latent"].items():
         if not len(of["steps"]) == len(of["error"]) == len(of["still"]):
             return f"latent of '{name}': its lists are not equally long"
-    return _unlike("methods", [entry["nmae_windows"] for entry in entries.values()]) or _unlike(
-        "methods", [entry["steps_within"] for entry in entries.values()]
+    every = [*entries.values()]
+    for row in result.get("conditions", []):
+        if {*row["methods"]} != {*entries}:
+            return f"condition '{row['condition']}' is not of the methods"
+        every += row["methods"].values()
+    return _unlike("methods", [entry["nmae_windows"] for entry in every]) or _unlike(
+        "methods", [entry["steps_within"] for entry in every]
     )
 
 

@@ -28,7 +28,7 @@ def show(
         key: only this section or value; raise UsageError where there is none.
         as_toml: print a TOML file instead of a table, a complete one without ``key``.
     """
-    values = dotted(settings.as_dict())
+    values = dotted(settings.as_dict(complete=True))
     named = [name for name in sources if not key or name == key or name.startswith(f"{key}.")]
     shown = [name for name in named if name in values]  # empty lists say nothing
     if not shown:
@@ -36,7 +36,7 @@ def show(
         near = meant(key, [*sections, *values])
         raise UsageError(f"no setting or section '{key}'; {near}choose from {', '.join(sections)}")
     if as_toml:
-        chosen = settings.as_dict()
+        chosen = settings.as_dict(complete=True)
         if key:  # this section or value alone, and the preset that all are of
             section, _, name = key.partition(".")
             inside = chosen[section]

@@ -29,7 +29,7 @@ from hjepa_cli.errors import NumericalError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import measured, show_gates
 from hjepa_cli.stages import baselines
-from hjepa_cli.stages.frame_training import fit
+from hjepa_cli.stages.frame_training import fit, recorded
 from hjepa_cli.stages.inputs import brought_along, count_frames, embed, open_dataset, pictures
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
@@ -157,10 +157,10 @@ def describe_architecture(settings: Settings) -> dict[str, Any]:
     encoder = settings.encoder
     if encoder.method != "jepa":
         return baselines.describe_architecture(settings)
-    recorded = {name: getattr(encoder, name) for name in ARCHITECTURE}
+    of_encoder = recorded(encoder, *ARCHITECTURE)
     # One level: the companion.
-    recorded |= {"h": encoder.h, "m": encoder.h, "l": encoder.h}
-    return {"kind": "encoder", **recorded, **pictures(settings)}
+    of_encoder |= {"h": encoder.h, "m": encoder.h, "l": encoder.h}
+    return {"kind": "encoder", **of_encoder, **pictures(settings)}
 
 
 def train_jepa(
@@ -171,7 +171,8 @@ def train_jepa(
     kind = plant_of(settings)
     encoder, companion = modules["encoder"], modules["high"]
     assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
-    encoder.fit_standardisation(standardisation_sample(train.frames))
+    look = {"frames_each": options.frames, "frame_gap": options.frame_gap}
+    encoder.fit_standardisation(standardisation_sample(train.frames, **look))
     if ranks.size > 1:
         if options.regulariser != "none":
             raise UsageError(

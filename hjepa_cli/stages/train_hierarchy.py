@@ -22,7 +22,7 @@ from hjepa_cli.config.schema import HierarchySettings, Settings
 from hjepa_cli.core.control.drivers import methods_of
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.networks import health
-from hjepa_cli.core.networks.model import LEVELS, levels_of, load_modules
+from hjepa_cli.core.networks.model import LEVELS, UNSAID, levels_of, load_modules
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training import levels
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
@@ -185,13 +185,14 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
     """
     if name is None:
         mine = settings.as_dict()
-        wanted = mine["encoder"]
+        wanted = UNSAID | mine["encoder"]
 
         def fits(run: Path) -> bool:
             config = read_config(run)
-            encoder = config["encoder"]
+            encoder = UNSAID | config["encoder"]
             is_jepa = encoder.get("method", "jepa") == "jepa"
-            alike = all(encoder[key] == wanted[key] for key in train_encoder.ARCHITECTURE)
+            keys = (*train_encoder.ARCHITECTURE, *UNSAID)
+            alike = all(encoder[key] == wanted[key] for key in keys)
             alike &= all(config.get(key) == mine.get(key) for key in PLANT)
             return is_jepa and alike
 
@@ -229,6 +230,7 @@ def trained_alike(source: Checkpoint, data: Dataset, settings: Settings) -> bool
     return (
         (metadata["dataset"], metadata["seed"]) == (data.digest, settings.seed)
         and theirs["actor"] == mine["actor"]
+        and theirs.get("augment") == mine.get("augment")
         and all(theirs["encoder"].get(key, 0) == mine["encoder"][key] for key in PICTURE_SETTINGS)
         and all(theirs["hierarchy"].get(key) == mine["hierarchy"][key] for key in FLAT_SETTINGS)
     )
@@ -338,6 +340,8 @@ def draw_batch(
 
 def join(views: list[EmbeddedTrajectories]) -> EmbeddedTrajectories:
     """Return all views of the trajectories as one set."""
-    return EmbeddedTrajectories(
-        torch.cat([view.z for view in views]), torch.cat([view.actions for view in views])
-    )
+    clean = None
+    if any(view.clean is not None for view in views):
+        clean = torch.cat([view.targets for view in views])
+    z, actions = (torch.cat([getattr(view, name) for view in views]) for name in ("z", "actions"))
+    return EmbeddedTrajectories(z, actions, clean)

@@ -270,12 +270,11 @@ def states_behind(train: RenderedSplit, settings: Settings, *, flip: bool) -> tu
     """
     kind, states = plant_of(settings), train.states.numpy().astype(float)
     starts, sides = [], []
-    for mirrored, shifts_px in views_of(settings, len(states), flip=flip):
-        shown_px = -shifts_px if mirrored else shifts_px
-        shown_px = shown_px * (WIDTH_PX / train.frames.shape[-2])  # in the camera's own pictures
+    for view in views_of(settings, len(states), flip=flip):
+        shown_px = view.before_px * (WIDTH_PX / train.frames.shape[-2])  # in the camera's own
         moved = kind.sideways(states, shown_px[:, None]) if shown_px.any() else states
         starts.append(moved.reshape(-1, states.shape[2]))
-        side = np.array(kind.force_signs) if mirrored else np.ones(len(kind.force_signs))
+        side = np.array(kind.force_signs) if view.mirrored else np.ones(len(kind.force_signs))
         sides.append(np.tile(side, (len(starts[-1]), 1)))
     return np.concatenate(starts), np.concatenate(sides)
 

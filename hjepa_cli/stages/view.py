@@ -35,7 +35,7 @@ from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import frames_of, frames_seen
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.radio.channel import rayleigh_power_gains
@@ -62,11 +62,14 @@ class Believer:
         self._last: torch.Tensor | None = None
         self._heard = False
         self.believed: list[Floats] = []
+        self.flagged: list[Bools] = []
 
     def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]."""
         told = (ages,) if takes_ages(self._controller) else ()
         forces_n: Floats = self._controller.act(delivered, packets, *told)
+        check = getattr(self._controller, "check", None)
+        self.flagged.append(np.zeros_like(delivered) if check is None else check.now.copy())
         self._heard |= packets is not None
         if not self._heard:  # the link is late: a device is believed to be at rest
             states = np.zeros((len(delivered), self._probe.shape[1]))
@@ -282,13 +285,13 @@ def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
     """Fit a linear probe from embeddings to states, on trajectories made from the seed."""
     count = min(PROBE_TRAJECTORIES, settings.collect.trajectories)
     recorded = generate(settings, "train")[:count]
-    camera = plant(settings.plant).camera()
+    camera = model.camera
     embeddings, states = [], []
     with screen.progress("fit probe", count, "trajectories") as bar:
         for trajectory in recorded.states:
             now = np.arange(1, len(trajectory), PROBE_EVERY)
-            pairs = trajectory[np.stack([now - 1, now], axis=1)]
-            embeddings.append(model.encode(frames_of(camera, pairs)))
+            shown = trajectory[frames_seen(now - 1, *model.look)]
+            embeddings.append(model.encode(frames_of(camera, shown)))
             states.append(torch.from_numpy(trajectory[now]))
             bar.advance()
     return health.fit_probe(torch.cat(embeddings), torch.cat(states))
@@ -313,4 +316,5 @@ def film(
             tick=bar.advance,
             watch=lambda k, now, forces_n: states.append(now.copy()),
         )
-    return Film(name, np.stack(states), np.stack(believer.believed), kind.in_band(np.stack(states)))
+    in_band, flagged = kind.in_band(np.stack(states)), np.stack(believer.flagged)
+    return Film(name, np.stack(states), np.stack(believer.believed), in_band, flagged)

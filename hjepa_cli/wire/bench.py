@@ -16,7 +16,7 @@ import numpy as np
 
 from hjepa_cli.core.arrays import Bools, Floats, Pixels
 from hjepa_cli.core.control.loop import Draws, LinkDraws, ScoredPlants
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import frames_back, frames_of
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.wire import protocol
@@ -90,6 +90,7 @@ class Fleet:
         first_number: int = 1,
     ) -> None:
         self.bundle, self._runtime, self._camera = bundle, runtime, camera
+        self._back = frames_back(*bundle.look)
         self._delivered, self._lost, self._first = delivered, lost, first_number
         steps, count = delivered.shape
         self.plants = ScoredPlants(
@@ -205,7 +206,7 @@ class Fleet:
 
     def _look(self, mask: Bools) -> Pixels:
         """Return the pictures [m, κ, 64, 128, 3] that some devices see now."""
-        seen = self.plants.sense(lambda states: states[:, -self.bundle.frames :], mask)
+        seen = self.plants.sense(lambda states: states[:, self._back], mask)
         return frames_of(self._camera, seen)
 
 

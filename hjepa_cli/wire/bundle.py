@@ -11,6 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli.core.plants.frames import LONGEST
 from hjepa_cli.errors import DataError, MissingInputError, shell
 from hjepa_cli.storage import files
 
@@ -50,6 +51,11 @@ class Bundle:
     def frames(self) -> int:
         """Return κ, the pictures that the encoder sees at once."""
         return int(self.manifest["frames"])
+
+    @property
+    def look(self) -> tuple[int, int]:
+        """Return κ and the steps between them, where there are more than one."""
+        return self.frames, int(self.manifest.get("frame_gap", 1))
 
     @property
     def axes(self) -> int:
@@ -130,6 +136,9 @@ def open_bundle(directory: Path) -> Bundle:
         good = (
             all(type(size) is int and 0 < size <= 65_535 for size in sizes)
             and all(isinstance(axis, int) and axis > 0 for axis in shape)
+            and type(gap := manifest.get("frame_gap", 1)) is int
+            and gap > 0
+            and gap * (manifest["frames"] - 1) < LONGEST
             and bundle.force_limit_n > 0
             and bundle.step_s > 0
             and 0 < len(bundle.plant.encode()) <= 16

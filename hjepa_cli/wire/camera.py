@@ -37,16 +37,16 @@ class Camera(Protocol):
 
 
 class Watched:
-    """It keeps the newest κ pictures of a camera, after looking at each.
+    """It keeps the newest pictures of a camera for an encoder, after looking at each.
 
     Args:
         camera: to read from.
-        frames: κ.
+        frames, frame_gap: κ, and how many pictures lie from one to the next.
     """
 
-    def __init__(self, camera: Camera, frames: int) -> None:
-        self._camera = camera
-        self._seen: deque[Pixels] = deque(maxlen=frames)
+    def __init__(self, camera: Camera, frames: int, frame_gap: int = 1) -> None:
+        self._camera, self._gap = camera, frame_gap
+        self._seen: deque[Pixels] = deque(maxlen=(frames - 1) * frame_gap + 1)
         self._equal = 0
 
     def read(self) -> bool:
@@ -80,7 +80,7 @@ class Watched:
     @property
     def frames(self) -> Pixels:
         """Return the pictures [1, κ, 64, 128, 3], the newest last."""
-        return np.stack(self._seen)[None]
+        return np.stack([*self._seen][:: self._gap])[None]
 
     def close(self) -> None:
         """Give the camera back."""

@@ -33,7 +33,7 @@ from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import hold, plan_stride
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.plants.control_law import control_of
-from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of, frames_seen
 from hjepa_cli.core.plants.named import camera_in
 from hjepa_cli.core.plants.recorded import Recorded
 from hjepa_cli.errors import DataError, NumericalError, UsageError, choices, require, shell
@@ -70,7 +70,7 @@ class _Seen(nn.Module):
         self.encoder = encoder
 
     def forward(self, frames: Tensor) -> Tensor:
-        seen = [frames[:, at].float() for at in reversed(range(frames.shape[1]))]
+        seen = self.encoder.fitted(frames)
         earlier = seen[1:]
         if self.encoder.frame_input == "difference":
             earlier = [later - before for later, before in pairwise(seen)]
@@ -246,6 +246,7 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
         "checkpoint": {"name": path.parent.name, "sha256": model.digest},
         "embedding": model.architecture["embedding"],
         "frames": model.frames,
+        **({"frame_gap": model.look[1]} if model.look[1] > 1 else {}),
         "frame_shape": list(FRAME_SHAPE),
         "camera": model.camera.manifest(),
         "action_shape": list(model.action_shape),
@@ -377,8 +378,8 @@ def pictures(model: Model, split: str, count: int) -> Pixels:
     settings = Settings(plant=model.plant_name, collect=collect, control=control)
     rows = max(1, min(32, getattr(collect, _SIZES[split])))
     states = generate(settings, split, range(rows)).states.astype(np.float64)
-    ends = np.arange(model.frames, states.shape[1] + 1)
-    windows = np.stack([states[:, end - model.frames : end] for end in ends], axis=1)
+    steps = np.arange(model.frames - 2, states.shape[1] - 1)
+    windows = states[:, frames_seen(steps, *model.look)]
     flat = windows.reshape(-1, *windows.shape[2:])
     chosen = np.random.default_rng(0).permutation(len(flat))[:count]
     return frames_of(model.camera, flat[chosen])

@@ -90,7 +90,8 @@ class Client:
 
     def __init__(self, bundle: Bundle, runtime: Runtime) -> None:
         self._bundle, self._runtime = bundle, runtime
-        self._seen: deque[Pixels] = deque(maxlen=bundle.frames)
+        frames, self._gap = bundle.look
+        self._seen: deque[Pixels] = deque(maxlen=(frames - 1) * self._gap + 1)
 
     def act(self, observation: Any) -> dict[str, Any]:
         """Return ``{"actions": float32 [16, m]}`` in newton, of this step and the next ones.
@@ -112,10 +113,10 @@ class Client:
         if observation.get("reset"):
             self._seen.clear()
         for picture in pictures:
-            while len(self._seen) < self._bundle.frames - 1:
+            while len(self._seen) < self._seen.maxlen - 1:  # type: ignore[operator]
                 self._seen.append(picture)
             self._seen.append(picture)
-        z, strides = self._runtime.encode(np.stack(self._seen)[None]), []
+        z, strides = self._runtime.encode(np.stack([*self._seen][:: self._gap])[None]), []
         for _ in range(-(-CHUNK_STEPS // self._bundle.stride)):
             forces_n, z = self._runtime.plan(z)
             strides.append(forces_n[0])

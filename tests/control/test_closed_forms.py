@@ -232,7 +232,7 @@ def test_the_held_out_trajectories_choose_the_ridge(monkeypatch: pytest.MonkeyPa
     noisy = dataclasses.replace(noisy, z=noisy.z + 3 * torch.randn(1, 30, 8, generator=random))
     splits = {"train": noisy, "test": linear_split(10, seed=9)}
     monkeypatch.setattr(linear_latent, "embed_split", lambda model, settings, split: splits[split])
-    model = SimpleNamespace(plant_name="desktop", architecture={"mirror": "none"}, device="cpu")
+    model = SimpleNamespace(plant=DESKTOP, architecture={"mirror": "none"}, device="cpu")
     chosen = linear_latent.fit_linear_latent(model, load_settings())
     errors = {fit.ridge: rollout_error(fit, splits["test"]) for fit in ridge_fits(noisy, None)}
     assert chosen.ridge == min(errors, key=errors.__getitem__) == 0.01
@@ -269,7 +269,7 @@ def test_a_reader_of_linear_embeddings_controls_as_well_as_the_teacher(
     monkeypatch.setattr("hjepa_cli.core.control.embedded_split.embed_states", embed)
 
     class Blind:
-        plant_name, frames = "desktop", 2
+        plant = DESKTOP
 
     model = Blind()
     reader = kalman.fit_state_reader(model, settings)

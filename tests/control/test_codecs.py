@@ -21,7 +21,7 @@ class Seen:
     """A stand-in for a model: embeddings that are a smooth function of the pole's pixels."""
 
     plant_name, architecture = "desktop", {"embedding": 16}
-    frames, device, camera = 2, "cpu", plant("desktop").camera()
+    camera, look, device = plant("desktop").camera(), (2, 1), "cpu"
 
     def __init__(self):
         self.mix = torch.from_numpy(np.random.default_rng(0).normal(size=(16, 16))).float()

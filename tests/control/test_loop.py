@@ -298,7 +298,7 @@ def test_a_packet_of_step_k_carries_the_frames_up_to_k() -> None:
     assert sent_at == {0: [0, 5, 10], 1: [0, 4, 9]}
     for k, packets in enumerate(recorder.packets):
         for device, seen in packets.items():
-            expected = [trajectory[max(k - back, -1)][device] for back in (3, 2, 1, 0)]
+            expected = [trajectory[max(k - back, -1)][device] for back in range(15, -1, -1)]
             assert np.allclose(seen, expected, atol=1e-12)
 
 

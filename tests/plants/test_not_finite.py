@@ -13,6 +13,7 @@ from hjepa_cli.core.networks.model import Model, build_modules
 from hjepa_cli.core.plants.conditions import Disturbed
 from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.named import Camera, CartPole, plant
+from hjepa_cli.core.plants.stress import parse
 from hjepa_cli.core.plants.system import Simulation, System
 from hjepa_cli.errors import NumericalError
 
@@ -50,7 +51,7 @@ def test_a_camera_draws_no_garbage(name: str, bad: float) -> None:
     system = plant(name)
     states = states_of(system)
     wrong = spoiled(states, bad)
-    for camera in (system.camera(), Disturbed(system.camera(), 0.8, 2.0, seed=0)):
+    for camera in (system.camera(), Disturbed(system.camera(), parse("light=0.8+noise=2"), seed=0)):
         before = camera.render(states)
         refused(f"states{place_of(states)}", bad, lambda camera=camera: camera.render(wrong))
         refused(f"state{[states.shape[1] - 1]}", bad, lambda c=camera: c.sketch_px(wrong[1]))

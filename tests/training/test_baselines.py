@@ -18,7 +18,7 @@ from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import Model, build_modules
 from hjepa_cli.core.networks.symmetry import flatten_twins, reflect, unflatten_twins
-from hjepa_cli.core.plants.frames import LONGEST, frames_seen
+from hjepa_cli.core.plants.frames import LONGEST, frames_back, frames_seen
 from hjepa_cli.core.training.batches import FrameWindows, TrajectoryBatch
 from hjepa_cli.core.training.frame_policies import Imitation
 from hjepa_cli.core.training.optimiser import Optimiser
@@ -82,7 +82,8 @@ def test_before_power_on_lie_copies_of_the_first_frame() -> None:
         [7, 8, 9, 10],
     ]
     assert frames_seen(5, 2).tolist() == [5, 6]
-    assert LONGEST == 4
+    assert frames_seen([3, 30], 4, 4).tolist() == [[0, 0, 0, 4], [19, 23, 27, 31]]
+    assert frames_back(4, 5).tolist() == [-16, -11, -6, -1] and LONGEST == 16
 
 
 def painted(trajectories: int, steps: int) -> torch.Tensor:

@@ -188,6 +188,21 @@ def test_sigreg_goes_on_along_the_directions_that_it_would_have_had(
     assert_equal_runs(tmp_path / "whole", tmp_path / "interrupted")
 
 
+def test_augmentation_goes_on_with_the_pictures_that_it_would_have_drawn(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = settings(augment__strength=1.0)
+    skip_actor(monkeypatch)
+    for name in ("whole", "interrupted", "interrupted"):
+        with monkeypatch.context() as patched, suppress(Interrupted):
+            if name == "interrupted":
+                signal_after(patched, 3)
+            train_encoder.run(chosen, QUIET, dataset=workplace / "data", out=tmp_path / name)
+    assert_equal_runs(tmp_path / "whole", tmp_path / "interrupted")
+    plain = workplace / "train-encoder" / "model.safetensors"
+    assert (tmp_path / "whole" / "model.safetensors").read_bytes() != plain.read_bytes()
+
+
 @pytest.mark.parametrize("stage", STEPS)
 def test_a_stop_between_saves_repeats_what_was_lost(
     stage: str, workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats, Integers
+from hjepa_cli.core.control.familiarity import PacketCheck
 from hjepa_cli.core.control.link import AHEAD_STEPS, REMEMBERED_STEPS, SentForces
 from hjepa_cli.core.networks.planning import Planner, Reaction
 from hjepa_cli.errors import UsageError
@@ -93,10 +94,25 @@ class StrideController(_Strides):
     """Plays a planner for n devices: a stride starts where the last one led to, or at a packet."""
 
     def __init__(
-        self, planner: Planner, devices: int, *, action_shape: tuple[int, ...] = ()
+        self,
+        planner: Planner,
+        devices: int,
+        *,
+        action_shape: tuple[int, ...] = (),
+        check: Callable[[int], PacketCheck] | None = None,
     ) -> None:
         super().__init__(planner.stride, devices, action_shape)
         self._planner, self._starts = planner, self._z
+        self.check = check(devices) if check else None
+
+    def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
+        """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
+
+        Those that its check keeps back change nothing: it goes on predicting.
+        """
+        if self.check is not None:
+            delivered, packets, ages = self.check.pass_on(delivered, packets, ages)
+        return super().act(delivered, packets, ages)
 
     def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
         """Move late packets on to the present."""
@@ -143,6 +159,7 @@ class FusingController(StrideController):
         devices: n.
         correct: maps predicted embeddings and those of packets [m, D] to what is taken for true.
         action_shape: A, of the plant.
+        check: keeps packets back that are not to be corrected by, either.
     """
 
     def __init__(
@@ -152,8 +169,9 @@ class FusingController(StrideController):
         *,
         correct: Callable[[Tensor, Tensor], Tensor],
         action_shape: tuple[int, ...] = (),
+        check: Callable[[int], PacketCheck] | None = None,
     ) -> None:
-        super().__init__(planner, devices, action_shape=action_shape)
+        super().__init__(planner, devices, action_shape=action_shape, check=check)
         self._correct, self._anchors = correct, self._z
         self._anchor_ages = np.zeros(devices, dtype=np.int64)
 

@@ -16,6 +16,8 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.codecs.codec import Coder
 from hjepa_cli.core.control.controllers import LastForce
 from hjepa_cli.core.control.disagreement import TwoLevels
+from hjepa_cli.core.control.embedded_split import sampled_embeddings
+from hjepa_cli.core.control.familiarity import PacketCheck, fit_familiarity
 from hjepa_cli.core.control.link import confirmation_bits
 from hjepa_cli.core.control.loop import Controller, Draws, Sensor
 from hjepa_cli.core.control.sensors import embedding_sensor
@@ -127,9 +129,22 @@ def coder_of(settings: Settings, model: Model) -> Coder:
     return coder
 
 
+@functools.lru_cache(maxsize=2)  # methods of one run share it
+def check_of(settings: Settings, model: Model) -> Callable[[int], PacketCheck] | None:
+    """Return what makes a check of packets, fitted to a model's; ``None`` where there is none."""
+    protocol, coder = settings.protocol, coder_of(settings, model)
+    if not protocol.false_alarm:
+        return None
+    train, test = (
+        coder.send(sampled_embeddings(model, settings, split)) for split in ("train", "test")
+    )
+    familiarity = fit_familiarity(train, test, protocol.false_alarm)
+    return functools.partial(PacketCheck, familiarity, protocol.flagged_in_row)
+
+
 def methods_of(model: Model) -> tuple[str, ...]:
     """Return what a model can drive its own plant with."""
-    return offered_methods(model.architecture, plant(model.plant_name))
+    return offered_methods(model.architecture, model.plant)
 
 
 def offered_methods(architecture: Mapping[str, Any], kind: System) -> tuple[str, ...]:

@@ -14,11 +14,13 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.datasets.trajectories import generate
-from hjepa_cli.core.plants.frames import frames_seen
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.frames import LONGEST, frames_seen
 
 if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
+
+
+SAMPLED = 2000  # embeddings that fits without labels take
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,9 +41,9 @@ class EmbeddedSplit:
 @functools.lru_cache(maxsize=2)  # the splits of one model
 def embed_split(model: "Model", settings: Settings, split: str) -> EmbeddedSplit:
     """Embed a whole split (``train`` or ``test``) of the settings."""
-    drawn, kind = generate(settings, split), plant(model.plant_name)
+    drawn, kind = generate(settings, split), model.plant
     count, steps = drawn.applied_n.shape[:2]
-    seen = frames_seen(np.arange(steps), model.frames)
+    seen = frames_seen(np.arange(steps), LONGEST)
     z = embed_states(model, drawn.states[:, seen].reshape(count * steps, *seen.shape[1:], -1))
     return EmbeddedSplit(
         z.reshape(count, steps, -1),
@@ -50,6 +52,14 @@ def embed_split(model: "Model", settings: Settings, split: str) -> EmbeddedSplit
     )
 
 
+def sampled_embeddings(model: "Model", settings: Settings, split: str) -> Tensor:
+    """Embed about :data:`SAMPLED` pictures of a split of the settings, evenly spaced: [n, D]."""
+    states = generate(settings, split).states
+    shown = states[:, frames_seen(np.arange(states.shape[1] - 1), LONGEST)]
+    shown = shown.reshape(-1, *shown.shape[2:])
+    return embed_states(model, shown[:: max(1, len(shown) // SAMPLED)])
+
+
 def embed_states(model: "Model", seen: Floats) -> Tensor:
-    """Embed what the plant's camera shows of states [n, κ, S], the present one last: [n, D]."""
+    """Embed what the plant's camera shows of the last states [n, 16, S] of devices: [n, D]."""
     return embedding_sensor(model)(seen).cpu()

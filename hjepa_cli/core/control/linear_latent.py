@@ -16,7 +16,6 @@ from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.control.embedded_split import EmbeddedSplit, embed_split
 from hjepa_cli.core.networks.encoder import normalise
 from hjepa_cli.core.networks.symmetry import reflect
-from hjepa_cli.core.plants.named import plant
 
 if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
@@ -78,7 +77,7 @@ def fit_linear_latent(model: "Model", settings: Settings) -> LinearLatent:
     held-out trajectory to its end, under the forces that were applied, stay closest (mean squared
     distance at an embedding's length). What is penalised is the change that a step makes.
     """
-    signs = plant(model.plant_name).force_signs if model.architecture["mirror"] == "exact" else None
+    signs = model.plant.force_signs if model.architecture["mirror"] == "exact" else None
     train, test = (embed_split(model, settings, split) for split in ("train", "test"))
     fits = ridge_fits(train, signs)
     errors = [rollout_error(fit, test) for fit in fits]

@@ -58,7 +58,8 @@ class Controller(Protocol):
 
 
 Sensor = Callable[[Floats], Any]
-"""The device side: the last states of m devices [m, 4, S], the present one last → packets [m, ...].
+"""The device side makes packets [m, ...] of the last states of m devices [m, 16, S], the present
+one last.
 
 Those before a device was switched on are copies of its first; see
 :func:`~hjepa_cli.core.plants.frames.frames_seen`.
@@ -315,21 +316,37 @@ class Outcome:
         score: share of steps inside the band [P, N].
         cost: mean capped quadratic cost [P, N].
         lost: 1 where the loop is :attr:`ScoredPlants.lost` after the last step, else 0 [P, N].
+        flagged: share of packets that the controller flagged, of all steps [P, N]; NaN or ``None``
+            where it looks at none.
     """
 
     score: Floats
     cost: Floats
     lost: Floats
+    flagged: Floats | None = None
 
     @classmethod
     def joined(cls, parts: Sequence["Outcome"], axis: int) -> "Outcome":
         """Join outcomes along points (axis 0) or devices (axis 1)."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(*(np.concatenate([getattr(one, name) for one in parts], axis) for name in names))
+        score, cost, lost = (
+            np.concatenate([getattr(one, name) for one in parts], axis)
+            for name in ("score", "cost", "lost")
+        )
+        flagged = None
+        if any(one.flagged is not None for one in parts):
+            of = [
+                np.full_like(one.score, np.nan) if one.flagged is None else one.flagged
+                for one in parts
+            ]
+            flagged = np.concatenate(of, axis)
+        return cls(score, cost, lost, flagged)
 
     def part(self, points: slice, devices: slice = slice(None)) -> "Outcome":
         """Take some of the points and devices."""
-        return Outcome(*(getattr(self, f.name)[points, devices] for f in dataclasses.fields(self)))
+        cut: dict[str, Any] = {
+            name: None if of is None else of[points, devices] for name, of in vars(self).items()
+        }
+        return Outcome(**cut)
 
 
 def simulate(
@@ -372,7 +389,21 @@ def simulate(
         watch(k, states, plants.move(forces_n))
         tick()
     means = plants.means(steps - draws.warmup_steps)
-    return Outcome(*(values.reshape(points, devices) for values in means))
+    score, cost, lost = (values.reshape(points, devices) for values in means)
+    flagged = share_flagged(controller)
+    return Outcome(score, cost, lost, None if flagged is None else flagged.reshape(score.shape))
+
+
+def share_flagged(controller: Any) -> Floats | None:
+    """Return the share of flagged packets of each device [n]; ``None`` where nobody looked.
+
+    A controller that looks has a :class:`~hjepa_cli.core.control.familiarity.PacketCheck`.
+    """
+    check = getattr(controller, "check", None)
+    flagged, received = (getattr(check, name, None) for name in ("flagged", "received"))
+    if not (isinstance(flagged, np.ndarray) and isinstance(received, np.ndarray)):
+        return None
+    return np.asarray(flagged / np.maximum(received, 1))
 
 
 class ScoredPlants:

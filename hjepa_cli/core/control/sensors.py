@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Floats, Pixels
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import frames_back, frames_of
 from hjepa_cli.core.plants.system import Camera
 
 if TYPE_CHECKING:
@@ -23,31 +23,42 @@ def is_pixels(seen: Floats | Pixels) -> TypeGuard[Pixels]:
 
 
 def true_state(seen: Floats) -> Floats:
-    """Return the state itself, exact: of the last states [m, 4, S] the present ones [m, S]."""
+    """Return the state itself, exact: of the last states [m, 16, S] the present ones [m, S]."""
     return seen[:, -1]
 
 
 def camera_sensor(
     model: "Model", camera: Camera | None = None
 ) -> Callable[[Floats | Pixels], Pixels]:
-    """Return a function from the last states [m, 4, S] to frames uint8 [m, κ, H, W, C].
+    """Return a function from the last states [m, 16, S] to frames uint8 [m, κ, H, W, C].
 
     κ are as many as the model's network sees, taken by the camera that the model was trained with
-    if none is given. What was recorded comes as frames uint8 [m, 4, H, W, C] in place of states.
+    if none is given. What was recorded comes as frames uint8 [m, 16, H, W, C] in place of states.
     """
-    camera = camera or model.camera
+    camera, back = camera or model.camera, frames_back(*model.look)
 
     def look(seen: Floats | Pixels) -> Pixels:
-        last = seen[:, -model.frames :]
-        return last if is_pixels(last) else frames_of(camera, last, SENSOR_BATCH)
+        last = seen[:, back]
+        if not is_pixels(last):
+            return frames_of(camera, last, SENSOR_BATCH)
+        return retaken(camera, last)
 
     return look
+
+
+def retaken(camera: Camera, frames: Pixels) -> Pixels:
+    """Return recorded frames [m, κ, H, W, C] under a camera's conditions; as they are without."""
+    retake: Callable[[Pixels], Pixels] | None = getattr(camera, "retake", None)
+    if retake is None or not len(frames):
+        return frames
+    starts = range(0, len(frames), SENSOR_BATCH)
+    return np.concatenate([retake(frames[start : start + SENSOR_BATCH]) for start in starts])
 
 
 def embedding_sensor(
     model: "Model", send: Callable[[Tensor], Tensor] | None = None, camera: Camera | None = None
 ) -> Callable[[Floats | Pixels], Tensor]:
-    """Return a function from the last states [m, 4, S], or frames, to received embeddings [m, D].
+    """Return a function from the last states [m, 16, S], or frames, to received embeddings [m, D].
 
     They are as ``send`` makes them arrive, [n, D] → [n, D]; without it those that the device has.
     """

@@ -97,7 +97,7 @@ class Digest:
         if _starts(values["collect"]) != starts:  # the dataset's are in ``clean``, these nowhere
             fitted.append(_starts(values["collect"]))
         payload = settings.protocol.payload
-        if CODECS[payload].fitted:
+        if CODECS[payload].fitted or settings.protocol.false_alarm:
             measured["fitted"] = fitted
         if plugin := CODECS.source(payload):
             measured["codec"] = plugin.sha256

@@ -16,11 +16,13 @@ from torch import Tensor
 from hjepa_cli.core import statistics
 from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.control.drivers import Driver
+from hjepa_cli.core.control.sensors import retaken
 from hjepa_cli.core.evaluation.bench import control_entry
 from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.frames import frames_seen
+from hjepa_cli.core.plants.system import Camera
 
 WITHIN = (0.02, 0.05, 0.1)  # of the force range
 
@@ -98,10 +100,10 @@ def steps_within(nmae: Floats | list[float], most: float) -> int:
 
 
 @torch.inference_mode()
-def embedded(model: Model, frames: Pixels) -> Tensor:
-    """Embed all steps of windows [N, K + 1, H, W, C]: float32 [N, K, D]."""
-    seen = frames_seen(np.arange(frames.shape[1] - 1), model.frames)
-    return torch.stack([model.encode(window[seen]) for window in frames])
+def embedded(model: Model, frames: Pixels, camera: Camera) -> Tensor:
+    """Embed all steps of windows [N, K + 1, H, W, C], under a camera's conditions: [N, K, D]."""
+    seen = frames_seen(np.arange(frames.shape[1] - 1), *model.look)
+    return torch.stack([model.encode(retaken(camera, window[seen])) for window in frames])
 
 
 @torch.inference_mode()

@@ -75,11 +75,15 @@ class Reference:
         """Return curve entries as printed.
 
         Each has its coordinate, the normalised score and its interval, the share of steps in the
-        band as it is, the LQ ratio, the share of loops that were lost, and the number of devices.
+        band as it is, the LQ ratio, the share of loops that were lost, the number of devices, and
+        the share of packets that were flagged, if somebody looked.
         """
         scores = self.relative_score(outcome)
         low, high = statistics.interval(self.score_replicates(outcome))
         devices = outcome.score.shape[1]
+        flagged = np.full(len(points), np.nan)
+        if outcome.flagged is not None:
+            flagged = outcome.flagged.mean(axis=1)
         lq_ratios = self.cost[:devices].mean() / outcome.cost.mean(axis=1)
         return [
             {
@@ -90,6 +94,7 @@ class Reference:
                 "lq_ratio": float(lq_ratios[i]),
                 "lost": float(outcome.lost[i].mean()),
                 "n_devices": devices,
+                **({} if np.isnan(flagged[i]) else {"flagged": float(flagged[i])}),
             }
             for i, point in enumerate(points)
         ]

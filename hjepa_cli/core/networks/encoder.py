@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils import fuse_conv_bn_eval
 
+from hjepa_cli.core.networks.photometry import against_background
 from hjepa_cli.core.networks.symmetry import (
     MirrorCentre,
     MirrorConv2d,
@@ -99,8 +100,10 @@ class Encoder(nn.Module):
             their length bends them little there and states stay linearly readable (docs/LOG.md).
         symmetric: whether the embedding of a mirrored picture is the reflected embedding; D is
             even then, and the offset is on the even half.
-        frames: κ, the current one and κ − 1 earlier ones.
+        frames, frame_gap: κ, the current one and κ − 1 earlier ones, and the steps between them.
         frame_shape: (H, W, C).
+        photometric: whether every frame is fitted to its background first, and by what; see
+            :func:`~hjepa_cli.core.networks.photometry.against_background`.
     """
 
     input_mean: Tensor
@@ -115,9 +118,12 @@ class Encoder(nn.Module):
         symmetric: bool = False,
         frames: int = 2,
         frame_shape: tuple[int, int, int] = FRAME_SHAPE,
+        photometric: str = "none",
+        frame_gap: int = 1,
     ) -> None:
         super().__init__()
         self.embedding, self.frame_input, self.symmetric = embedding, frame_input, symmetric
+        self.photometric, self.look = photometric, (frames, frame_gap)
         *size, colours = frame_shape
         channels, rows_columns = frames * colours, map_of(*size)
         pixels = STEM_PX * 2 ** stages_of(*size)
@@ -209,14 +215,30 @@ class Encoder(nn.Module):
     def inputs(self, frames: Tensor) -> Tensor:
         """Return what the network sees of frames [N, κ, H, W, C], the present first.
 
-        It is [N, Cκ, H, W] in bfloat16: pixels and their differences are exact in it.
+        It is [N, Cκ, H, W] in bfloat16: pixels and their differences are exact in it. Pixels that
+        are fitted to their background are float32, and rounded where networks compute in bfloat16,
+        but their differences before that.
         """
-        seen = [frame.bfloat16() for frame in reversed(frames.unbind(1))]
+        dtype = torch.bfloat16
+        if self.photometric == "none":
+            seen = [frame.to(dtype) for frame in reversed(frames.unbind(1))]
+        else:
+            if not torch.is_autocast_enabled(frames.device.type):
+                dtype = torch.float32
+            seen = self.fitted(frames)
         earlier = seen[1:]
         if self.frame_input == "difference":
             earlier = [later - before for later, before in pairwise(seen)]
         # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.
-        return torch.cat([seen[0], *earlier], dim=-1).permute(0, 3, 1, 2)
+        together = [part.to(dtype) for part in (seen[0], *earlier)]
+        return torch.cat(together, dim=-1).permute(0, 3, 1, 2)
+
+    def fitted(self, frames: Tensor) -> list[Tensor]:
+        """Return the κ pictures [N, H, W, C] of frames, fitted to their background, float32."""
+        if self.photometric == "none":
+            return [frame.float() for frame in reversed(frames.unbind(1))]
+        fitted = against_background(frames.flatten(0, 1), self.photometric)
+        return [*reversed(fitted.view(frames.shape).unbind(1))]
 
 
 def _fold(module: nn.Module, convolution: str, norm: str) -> None:

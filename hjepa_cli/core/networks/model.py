@@ -19,8 +19,10 @@ from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import Strides, build_predictors
 from hjepa_cli.core.networks.outside import embeddings_from, frames_from
+from hjepa_cli.core.networks.photometry import FITS
 from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
+from hjepa_cli.core.plants.frames import LONGEST
 from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, UsageError, shell
@@ -32,11 +34,18 @@ KINDS = ("encoder", "hierarchy", "flat", "supervised", "autoencoder", "reflex")
 CHOICES = {  # of an architecture; its other values are sizes
     "frame_input": ("difference", "pair"),
     "frames": (2, 4),
+    "frame_gap": tuple(range(1, LONGEST)),
     "stride_actions": ("all", "held"),
     "centre": (True, False),
     "residual": (True, False),
     "mirror": ("exact", "augment", "none"),
+    "photometric": FITS,
 }
+UNSAID = {
+    "frames": 2,
+    "frame_gap": 1,
+    "photometric": "none",
+}  # of an encoder, where its architecture has no such
 PRECISIONS = ("auto", "bf16", "fp32")
 LEVELS = {  # of each kind that has some, in the order of the checkpoint
     "encoder": ("high",),
@@ -69,14 +78,18 @@ def build_modules(
     if kind not in KINDS:
         built: nn.ModuleDict = _extended(kind).modules(architecture, action_shape, force_signs)
         return built
-    embedding, frames = architecture["embedding"], architecture.get("frames", 2)
+    architecture = {**UNSAID, **architecture}
+    embedding, frames = architecture["embedding"], architecture["frames"]
     symmetric = architecture["mirror"] == "exact"
     mirror = force_signs if symmetric else None
     frame_shape = camera_in(architecture).frame_shape
 
     def encoder() -> Encoder:
         frame_input, centre = architecture["frame_input"], architecture["centre"]
-        return Encoder(embedding, frame_input, centre, symmetric, frames, frame_shape)
+        fit, gap = architecture["photometric"], architecture["frame_gap"]
+        return Encoder(
+            embedding, frame_input, centre, symmetric, frames, frame_shape, fit, frame_gap=gap
+        )
 
     def actor() -> Actor:
         hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
@@ -269,7 +282,10 @@ class Model:
         self.precision: str = metadata["settings"]["encoder"]["precision"]
         self.plant = kind = plant_in(self.plant_name, metadata["settings"])
         self.force_limit_n, self.action_shape = kind.force_limit_n, kind.action_shape
-        self.frames: int = self.architecture.get("frames", 2)
+        self.frames, frame_gap = (
+            {**UNSAID, **self.architecture}[k] for k in ("frames", "frame_gap")
+        )
+        self.look: tuple[int, int] = (self.frames, frame_gap)
         self.camera = camera_of(kind, camera_in(self.architecture))
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)

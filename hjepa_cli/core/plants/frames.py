@@ -10,7 +10,7 @@ from hjepa_cli.core.plants.system import Camera
 
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 FRAME_SHAPE = (HEIGHT_PX, WIDTH_PX, CHANNELS)
-LONGEST = 4  # frames, κ; a device keeps so many
+LONGEST = 16  # frames that a device keeps, from which its network sees κ
 
 
 def frame_bits(frame_shape: tuple[int, int, int]) -> int:
@@ -18,19 +18,25 @@ def frame_bits(frame_shape: tuple[int, int, int]) -> int:
     return 8 * math.prod(frame_shape)
 
 
-def frames_seen(k: ArrayLike, frames: int) -> Integers:
+def frames_seen(k: ArrayLike, frames: int, gap: int = 1) -> Integers:
     """Return the stored frames that a device looks at in step k: int64 [*K, κ], the oldest first.
 
-    The last of the κ is that of step k [*K] itself. Frame 0 is the one before k = 0, where a
-    device is switched on; what would lie before it is a copy of it.
+    They are ``gap`` steps apart; the last of the κ is that of step k [*K] itself. Frame 0 is the
+    one before k = 0, where a device is switched on; what would lie before it is a copy of it.
     """
-    return np.maximum(np.asarray(k)[..., None] + np.arange(2 - frames, 2), 0)
+    return np.maximum(np.asarray(k)[..., None] + 2 + frames_back(frames, gap), 0)
+
+
+def frames_back(frames: int, gap: int = 1) -> Integers:
+    """Return the indices [κ] of what a network sees among the last frames of a device."""
+    return gap * np.arange(1 - frames, 1) - 1
 
 
 def frames_of(camera: Camera, states: ArrayLike, batch: int | None = None) -> Pixels:
     """Render states [N, …, S] into frames uint8 [N, …, H, W, C]: 64 × 128 × 3, or ``frame_shape``.
 
-    ``batch`` of the N are rendered at a time, which bounds the memory; all by default.
+    ``batch`` of the N are rendered at a time, which bounds the memory; all by default. A camera
+    that has ``film`` is told which states [N, κ, S] belong to one packet.
 
     Raises:
         NumericalError: a state is not finite.
@@ -38,8 +44,12 @@ def frames_of(camera: Camera, states: ArrayLike, batch: int | None = None) -> Pi
     states = finite(states, "states")
     shape = getattr(camera, "frame_shape", FRAME_SHAPE)
     frames = np.empty((*states.shape[:-1], *shape), np.uint8)
+    film = getattr(camera, "film", None) if states.ndim == 3 else None
     for start in range(0, len(states), batch or max(len(states), 1)):
         part = slice(start, start + (batch or len(states)))
+        if film is not None:
+            frames[part] = film(states[part])
+            continue
         frames[part].reshape(-1, *shape)[:] = camera.render(
             states[part].reshape(-1, states.shape[-1])
         )

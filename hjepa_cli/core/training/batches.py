@@ -25,12 +25,19 @@ class TrajectoryBatch:
         actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
         drawn: the windows' names, for messages.
         labels: the teacher's actions there ÷ force limit [B · F, *A], if the windows have any.
+        worse: what a network shall see instead of ``frames``, of which targets are made.
     """
 
     frames: Tensor
     actions: Tensor
     drawn: str = ""
     labels: Tensor | None = None
+    worse: Tensor | None = None
+
+    @property
+    def seen(self) -> Tensor:
+        """Return what a network sees that learns."""
+        return self.frames if self.worse is None else self.worse
 
 
 def window_indices(
@@ -65,7 +72,8 @@ class FrameWindows:
         shift_px: move every window sideways by −shift_px … shift_px whole pixels, the same for all
             its frames: exact physics as well, as long as nothing leaves the picture.
         labels: the teacher in shifted pictures, where that is wanted.
-        frames_each: κ, of which a device remembers no more than it has seen.
+        frames_each, frame_gap: κ, of which a device remembers no more than it has seen, and how
+            many steps they are apart.
     """
 
     def __init__(
@@ -80,13 +88,14 @@ class FrameWindows:
         mirrored_actions: float | tuple[float, ...] = -1.0,
         labels: Labels | None = None,
         frames_each: int = 2,
+        frame_gap: int = 1,
     ) -> None:
         self.frames, self.actions = frames, actions
         self.steps = actions.shape[1]
         self.window_frames = min(window_frames, (self.steps - 1) // stride + 1)
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
         self.mirrored_actions = torch.tensor(mirrored_actions)
-        self.labels, self.frames_each = labels, frames_each
+        self.labels, self.frames_each, self.frame_gap = labels, frames_each, frame_gap
 
     def draw(
         self, count: int, generator: np.random.Generator, share: slice = slice(None)
@@ -102,7 +111,7 @@ class FrameWindows:
         k = torch.from_numpy(steps[share])
         actions = stride_actions(self.actions[trajectories], k, self.stride)
         rows = trajectories[:, None]
-        seen = torch.from_numpy(frames_seen(k.numpy(), self.frames_each))
+        seen = torch.from_numpy(frames_seen(k.numpy(), self.frames_each, self.frame_gap))
         frames = self.frames[rows[..., None], seen]
         flipped = torch.zeros(len(k), dtype=torch.bool)
         if self.mirror:

@@ -53,7 +53,7 @@ class Imitation(Phase):
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
         """Return the term ``force`` of a batch with labels, in units of the force limit squared."""
         assert batch.labels is not None
-        frames, labels = batch.frames.to(self.device), batch.labels.to(self.device)
+        frames, labels = batch.seen.to(self.device), batch.labels.to(self.device)
         forces = self.networks["actor"](read_frames(self.networks, frames))
         return {"force": F.mse_loss(forces.float(), labels)}
 
@@ -66,11 +66,15 @@ class Reconstruction(Phase):
 
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
         """Return the term ``reconstruction``: mean squared error in each channel's variance."""
-        return {"reconstruction": self.error(batch.frames)}
+        return {"reconstruction": self.error(batch.frames, batch.worse)}
 
-    def error(self, frames: Tensor) -> Tensor:
-        """Return the mean squared error of frames [N, κ, 64, 128, 3]; the mean frame's is 1."""
+    def error(self, frames: Tensor, worse: Tensor | None = None) -> Tensor:
+        """Return the mean squared error of frames [N, κ, 64, 128, 3]; the mean frame's is 1.
+
+        They are reconstructed from ``worse`` ones, where there are any.
+        """
         encoder, decoder = self.networks["encoder"], self.networks["decoder"]
         assert isinstance(encoder, Encoder) and isinstance(decoder, Decoder)
         inputs = encoder.inputs(frames.to(self.device))
-        return F.mse_loss(decoder(encoder.embed(inputs)), decoder.standardise(inputs))
+        seen = inputs if worse is None else encoder.inputs(worse.to(self.device))
+        return F.mse_loss(decoder(encoder.embed(seen)), decoder.standardise(inputs))

@@ -28,10 +28,12 @@ class RenderedSplit:
     actions: Tensor
     labels: Tensor
 
-    def seen(self, every: int, *, frames: int = 2, mirrored: bool = False) -> Tensor:
+    def seen(
+        self, every: int, *, frames: int = 2, frame_gap: int = 1, mirrored: bool = False
+    ) -> Tensor:
         """Return what a device looks at in k = 0, ``every``, …: uint8 [N · K, κ, H, W, 3]."""
         steps = np.arange(0, self.frames.shape[1] - 1, every)
-        seen = self.frames[:, torch.from_numpy(frames_seen(steps, frames))]
+        seen = self.frames[:, torch.from_numpy(frames_seen(steps, frames, frame_gap))]
         return (seen.flip(-2) if mirrored else seen).flatten(0, 1)
 
     def slice(self, start: int, stop: int) -> "RenderedSplit":
@@ -65,11 +67,13 @@ def labels_of(split: RenderedSplit, kind: System, act: Teacher) -> Labels:
     return labels
 
 
-def standardisation_sample(frames: Tensor, count: int = 512, *, frames_each: int = 2) -> Tensor:
+def standardisation_sample(
+    frames: Tensor, count: int = 512, *, frames_each: int = 2, frame_gap: int = 1
+) -> Tensor:
     """Return evenly spaced inputs [≤ ``count``, κ, H, W, 3] of frames [N, T + 1, H, W, 3]."""
     length = frames.shape[1]
     total = len(frames) * length
     current = np.linspace(1, total - 1, min(count, total - 1)).astype(int)
     rows, stored = np.divmod(current[current % length != 0], length)  # 0 has no predecessor
-    seen = torch.from_numpy(frames_seen(stored - 1, frames_each))
+    seen = torch.from_numpy(frames_seen(stored - 1, frames_each, frame_gap))
     return frames[torch.from_numpy(rows)[:, None], seen]

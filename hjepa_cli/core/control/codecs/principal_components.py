@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from hjepa_cli.config.schema import Settings
     from hjepa_cli.core.networks.model import Model
 
-FIT_EMBEDDINGS = 2000
 RANGE_MARGIN = 1.05  # of the largest coefficient seen; beyond, a coefficient is clipped
 
 
@@ -81,15 +80,10 @@ def fit_components(z: Tensor, components: int, bits_per_value: int) -> Principal
 
 @functools.lru_cache(maxsize=1)  # methods of one run share it
 def training_embeddings(model: Model, settings: Settings) -> Tensor:
-    """Embed some pairs of frames from the training trajectories of the settings' seed [n, D]."""
-    import numpy as np
+    """Embed some of the pictures of the training trajectories of the settings' seed [n, D]."""
+    from hjepa_cli.core.control.embedded_split import sampled_embeddings
 
-    from hjepa_cli.core.control.embedded_split import embed_states
-    from hjepa_cli.core.datasets.trajectories import generate
-
-    states = generate(settings, "train").states
-    pairs = np.stack([states[:, :-1], states[:, 1:]], axis=2).reshape(-1, 2, states.shape[2])
-    return embed_states(model, pairs[:: max(1, len(pairs) // FIT_EMBEDDINGS)])
+    return sampled_embeddings(model, settings, "train")
 
 
 def _member(name: str) -> Codec | None:

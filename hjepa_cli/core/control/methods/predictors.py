@@ -36,14 +36,18 @@ def predictor(
     def build(settings: Settings, model: Model) -> Driver:
         from hjepa_cli.core.control.controllers import FusingController
         from hjepa_cli.core.control.disagreement import TwoLevels
-        from hjepa_cli.core.control.drivers import embedding_driver
+        from hjepa_cli.core.control.drivers import check_of, embedding_driver
         from hjepa_cli.core.control.planners import OnePredictor
 
         made: Any = planner(model)
-        drives = _strides(model, made)
+        drives = _strides(settings, model, made)
         if fused:
             drives = functools.partial(
-                FusingController, made, action_shape=model.action_shape, correct=made.correct
+                FusingController,
+                made,
+                action_shape=model.action_shape,
+                check=check_of(settings, model),
+                correct=made.correct,
             )
 
         def two_levels(devices: int) -> TwoLevels:
@@ -57,10 +61,14 @@ def predictor(
     return Method(name, "embedding", build, planner=planner, **about)
 
 
-def _strides(model: Model, planner: Planner) -> Callable[[int], StrideController]:
+def _strides(
+    settings: Settings, model: Model, planner: Planner
+) -> Callable[[int], StrideController]:
     from hjepa_cli.core.control.controllers import StrideController
+    from hjepa_cli.core.control.drivers import check_of
 
-    return functools.partial(StrideController, planner, action_shape=model.action_shape)
+    check, shape = check_of(settings, model), model.action_shape
+    return functools.partial(StrideController, planner, action_shape=shape, check=check)
 
 
 def _hierarchy(model: Model) -> Planner:
@@ -131,7 +139,7 @@ def _linear(settings: Settings, model: Model) -> Driver:
     from hjepa_cli.core.control.linear_latent import LinearPlanner, fit_linear_latent
 
     planner = LinearPlanner(fit_linear_latent(model, settings), model.actor, model.force_limit_n)
-    return embedding_driver("linear", settings, model, _strides(model, planner))
+    return embedding_driver("linear", settings, model, _strides(settings, model, planner))
 
 
 LINEAR = Method(

@@ -1,0 +1,205 @@
+"""Training pictures are made worse as much as the settings say; targets and labels stay clean."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from hjepa_cli.config.schema import AugmentSettings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.networks.encoder import Encoder
+from hjepa_cli.core.networks.predictors import Predictor
+from hjepa_cli.core.training.augmentation import Augmentation
+from hjepa_cli.core.training.batches import TrajectoryBatch
+from hjepa_cli.core.training.jepa import Jepa
+from hjepa_cli.core.training.levels import EmbeddedTrajectories, flat_loss
+from hjepa_cli.core.training.rendered import RenderedSplit
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages.embedding_training import embed_all
+
+OFF = {
+    field.name: 0.0
+    for field in dataclasses.fields(AugmentSettings)
+    if field.name not in ("strength", "share", "copies")
+}
+COUNT = 400
+
+
+def augmented(frames: torch.Tensor, seed: int = 1, **effects: float) -> torch.Tensor:
+    """One window in which every picture has the effects given, and no others."""
+    settings = AugmentSettings(strength=1.0, share=1.0, **{**OFF, **effects})
+    return Augmentation(settings)(frames, [seed]).float()
+
+
+def grey(level: int = 128, count: int = COUNT) -> torch.Tensor:
+    return torch.full((count, 2, 64, 128, 3), level, dtype=torch.uint8)
+
+
+def ramp(count: int = COUNT) -> torch.Tensor:
+    """Pictures whose red tells the column and whose green the row, 1 and 2 levels a pixel."""
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(128), indexing="ij")
+    one = torch.stack([columns, 2 * rows, 0 * rows], dim=-1).to(torch.uint8)
+    return one.expand(count, 2, 64, 128, 3).clone()
+
+
+def test_off_it_does_nothing_and_draws_nothing() -> None:
+    stream = np.random.default_rng(0)
+    before = stream.bit_generator.state
+    augment, frames = Augmentation(AugmentSettings()), grey(count=2)
+    assert augment(frames, augment.draw(3, stream)) is frames
+    assert stream.bit_generator.state == before
+    assert "augment" not in load_settings().as_dict()
+    assert load_settings(flags={"augment.strength": 1.0}).as_dict()["augment"]["copies"] == 2
+
+
+def test_a_window_follows_from_its_seed_alone() -> None:
+    augment = Augmentation(AugmentSettings(strength=1.0))
+    frames = torch.cat([ramp(5), grey(200, 5)])
+    both = augment(frames, [3, 4])
+    assert both.dtype == torch.uint8 and both.shape == frames.shape
+    assert torch.equal(both[5:], augment(frames[5:], [4]))
+    assert not torch.equal(both[5:], augment(frames[5:], [5]))
+    assert torch.equal(frames, torch.cat([ramp(5), grey(200, 5)])), "and is not changed in place"
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(both, augment(frames, [3, 4]))
+
+
+def test_light_and_colour_are_of_an_input_and_flicker_of_a_frame() -> None:
+    gain = augmented(grey(100), gain=0.3) / 100
+    assert (gain == gain[:, :1, :1, :1, :1]).all()
+    gain = gain[:, 0, 0, 0, 0]
+    assert gain.min() >= 0.695 and gain.max() <= 1.305
+    assert abs(gain.std() - 0.6 / 12**0.5) < 4 * 0.6 / 12**0.5 / (2 * COUNT) ** 0.5
+    colour = augmented(grey(), colour=0.2)
+    assert (colour == colour[:, :1, :1, :1]).all() and (colour[..., 0] != colour[..., 1]).any()
+    flicker = augmented(grey(250), flicker=0.2)[:, :, 0, 0, 0]
+    assert flicker.max() <= 250 and flicker.min() >= 199.5
+    assert (flicker[:, 0] != flicker[:, 1]).float().mean() > 0.9
+    bent = augmented(grey(128), gamma=0.3)[:, 0, 0, 0, 0]
+    bounds = [255 * 0.5**power for power in (1.3, 1 / 1.3)]
+    assert bounds[0] - 1 <= bent.min() < bounds[0] + 2
+    assert bounds[1] - 2 < bent.max() <= bounds[1] + 1
+    for level in (0, 255):
+        assert (augmented(grey(level, 8), gamma=0.3) == level).all()
+    across = augmented(grey(250), gradient=0.4)[:, 0, :, :, 0]
+    darkest, brightest = across.flatten(1).amin(1), across.flatten(1).amax(1)
+    fall = (brightest - darkest) / brightest
+    assert 0.3 < fall.max() <= 0.6 and fall.min() < 0.05  # both edges together, at a corner
+    sides = torch.stack(
+        [across[:, 32, 0] - across[:, 32, -1], across[:, 0, 64] - across[:, -1, 64]]
+    )
+    assert (sides.amax(1) > 20).all() and (sides.amin(1) < -20).all(), "in any direction"
+
+
+def test_noise_is_drawn_for_every_frame_and_shot_noise_goes_with_the_light() -> None:
+    read = augmented(grey(count=60), read_noise=8.0) - 128
+    width = read.std((1, 2, 3, 4))
+    assert width.max() < 8.2 and width.max() > 7 and width.min() < 1
+    busy = read[width > 4]
+    assert abs((busy[:, 0] * busy[:, 1]).mean()) < 4 * 64 / busy[:, 0].numel() ** 0.5
+    shot = [augmented(grey(level, 60), shot_noise=8.0).std((1, 2, 3, 4)) for level in (60, 240)]
+    loud = shot[1] > 2
+    # Rounding adds a variance of 1/12 to both.
+    ratio = ((shot[1] ** 2 - 1 / 12) / (shot[0] ** 2 - 1 / 12))[loud]
+    assert (abs(ratio - 4) < 0.4).sum() > 0.8 * loud.sum()
+
+
+def test_places_move_as_far_as_they_should() -> None:
+    jitter = augmented(ramp(), jitter_px=2.0)[:, :, 32, 64, :2]
+    moved_px = (jitter - torch.tensor([64.0, 64.0])) / torch.tensor([1.0, 2.0])
+    for axis in range(2):
+        assert moved_px[..., axis].std() == pytest.approx(2.0, rel=4 / (4 * COUNT) ** 0.5)
+    between = np.corrcoef(moved_px[:, 0, 0], moved_px[:, 1, 0])[0, 1]
+    assert abs(between) < 4 / COUNT**0.5, "each frame is moved for itself"
+    turned = augmented(ramp(), rotation_deg=10.0)[:, :, 20:45, 40:90]
+    # The column grows by cos along a row and by ∓ sin down a column: isotropic in pixels.
+    along, down = (turned[..., 0].diff(dim=axis).mean((2, 3)) for axis in (3, 2))
+    angle = torch.rad2deg(torch.atan2(down, along))
+    assert (angle[:, 0] - angle[:, 1]).abs().max() < 0.2, "one angle for an input"
+    assert 9 < angle.abs().max() < 10.1 and (angle > 0).any() and (angle < 0).any()
+    torch.testing.assert_close(along**2 + down**2, torch.ones_like(along), atol=0.03, rtol=0)
+    rows_along = turned[..., 1].diff(dim=3).mean((2, 3)) / 2
+    torch.testing.assert_close(rows_along, -down, atol=0.06, rtol=0)  # of whole grey levels
+
+
+def test_blur_and_rectangles() -> None:
+    dot = torch.zeros(40, 2, 64, 128, 3, dtype=torch.uint8)
+    dot[:, :, 20:44, 40:88] = 200
+    blurred = torch.stack([augmented(dot, seed, blur_px=2.0) for seed in range(8)])
+    edge = blurred[:, 0, 0, 32, 30:50, 0].diff(dim=1) / 200  # the kernel's own profile
+    columns = torch.arange(edge.shape[1], dtype=torch.float32)
+    mean = (edge * columns).sum(1, keepdim=True)
+    width_px = ((columns - mean) ** 2 * edge).sum(1).clamp_min(0).sqrt()
+    assert 1.2 < width_px.max() < 2.1 and width_px.min() < 1
+    hidden = augmented(grey(count=100), rectangle_px=12.0) != 128
+    assert (hidden[:, 0] == hidden[:, 1]).all(), "before both frames"
+    rows = hidden[:, 0, :, :, 0].any(2).sum(1)
+    columns = hidden[:, 0, :, :, 0].any(1).sum(1)
+    assert rows.max() <= 12 and rows.max() >= 10 and (rows != columns).any()
+    quarters = hidden[:, 0, :, :, 0].any(0).view(2, 32, 2, 64).any(3).any(1)
+    assert quarters.all(), "anywhere"
+
+
+class Seen(Encoder):
+    """An encoder that remembers what it saw."""
+
+    def forward(self, frames: torch.Tensor) -> torch.Tensor:
+        self.frames = frames
+        return super().forward(frames)
+
+
+def test_the_context_encoder_sees_worse_pictures_than_its_target() -> None:
+    encoder = Seen(16, "difference", centre=False)
+    jepa = Jepa(
+        encoder, Predictor(16, 16, 4), ema_decay=0.9, inverse_dynamics=0.0, rollout_strides=1,
+        device=torch.device("cpu"),
+    )  # fmt: skip
+    batch = TrajectoryBatch(grey(100, 4), torch.zeros(2, 1, 4), worse=grey(50, 4))
+    jepa.losses(batch)
+    target: Any = jepa.target.module
+    assert torch.equal(encoder.frames, batch.worse) and torch.equal(target.frames, batch.frames)
+
+
+class Means(nn.Module):
+    """It embeds a picture as its mean, twice."""
+
+    def forward(self, frames: torch.Tensor) -> torch.Tensor:
+        return frames.float().mean((1, 2, 3))[:, :2]
+
+
+def test_augmented_copies_have_clean_labels_and_clean_embeddings_to_reach() -> None:
+    frames = torch.randint(0, 255, (5, 9, 64, 128, 3), dtype=torch.uint8)
+    states, forces = torch.rand(5, 8, 4), torch.rand(5, 8)
+    split = RenderedSplit(frames, states, forces, 0.5 * forces)
+    changes = {"augment.strength": 1.0, "augment.copies": 3, "hierarchy.shifted_copies": 1}
+    settings = load_settings(flags=changes)
+    views = embed_all(Means(), split, settings, Screen(quiet=True), flip=False)
+    assert len(views) == 2 + 3
+    clean, copies = views[:2], views[2:]
+    for number, (copy, labels) in enumerate(copies):
+        source, source_labels = clean[number * 2 // 3]
+        assert torch.equal(labels, source_labels) and torch.equal(copy.actions, source.actions)
+        assert copy.clean is not None and torch.equal(copy.clean, source.z)
+        assert not torch.equal(copy.z, source.z)
+    assert not torch.equal(copies[0][0].z, copies[1][0].z)
+    plain = load_settings(flags={"hierarchy.shifted_copies": 1})
+    before = embed_all(Means(), split, plain, Screen(quiet=True), flip=False)
+    for (view, labels), (same, same_labels) in zip(clean, before, strict=True):
+        assert torch.equal(view.z, same.z) and torch.equal(labels, same_labels)
+
+
+def test_predictors_start_at_worse_embeddings_and_are_to_reach_clean_ones() -> None:
+    z = torch.nn.functional.normalize(torch.randn(3, 6, 4), dim=-1) * 2
+    other = torch.nn.functional.normalize(torch.randn(3, 6, 4), dim=-1) * 2
+    data = EmbeddedTrajectories(other, torch.zeros(3, 6), z)
+
+    def stays(state: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        return state
+
+    stream = np.random.default_rng(0)
+    loss = flat_loss(stays, data, 1, horizon_steps=1, trajectories=3, starts=5, generator=stream)
+    cosines = torch.nn.functional.cosine_similarity(other[:, :-1], z[:, 1:], dim=-1)
+    assert float(loss) == pytest.approx(float(1 - cosines.mean()), abs=1e-5)

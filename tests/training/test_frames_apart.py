@@ -1,0 +1,76 @@
+"""Four frames, next to each other or further apart, from training to the closed loop."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control.embedded_split import embed_split
+from hjepa_cli.core.evaluation.protocol import Point
+from hjepa_cli.core.evaluation.simulator import Block, Simulator
+from hjepa_cli.core.networks.model import Model
+from hjepa_cli.errors import UsageError
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages import collect, train_encoder, train_hierarchy
+from hjepa_cli.stages.inputs import embed, open_dataset, render
+
+QUIET = Screen(quiet=True)
+TINY = {
+    "collect.trajectories": 3, "collect.test_trajectories": 2, "collect.clean_trajectories": 2,
+    "collect.steps": 30, "collect.clean_steps": 12, "protocol.horizon": 10,
+    "encoder.embedding": 16, "encoder.hidden": 16, "actor.hidden": 16, "encoder.steps": 3,
+    "encoder.batch_trajectories": 2, "encoder.batch_frames": 4, "encoder.gate": False,
+    "actor.epochs": 1, "actor.batch": 40, "hierarchy.rollout_steps": 8,
+    "hierarchy.batch_trajectories": 2, "hierarchy.coarse_steps": 2, "hierarchy.flat_steps": 2,
+    "hierarchy.medium_steps": 2, "hierarchy.low_steps": 2,
+    "encoder.frames": 4, "encoder.frame_gap": 4, "encoder.photometric": "affine",
+    "augment.strength": 1.0, "protocol.warmup_steps": 0, "protocol.steps": 30,
+    "protocol.curve_devices": 2, "protocol.bracket_devices": 2, "protocol.payload": "float32",
+    "protocol.false_alarm": 0.1,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root, settings = tmp_path_factory.mktemp("apart"), load_settings(flags=TINY)
+    collect.run(settings, QUIET, out=root / "data")
+    train_encoder.run(settings, QUIET, dataset=root / "data", out=root / "encoder")
+    train_hierarchy.run(
+        settings, QUIET, dataset=root / "data", encoder=str(root / "encoder"), out=root / "model"
+    )
+    return root
+
+
+def test_training_and_devices_see_the_same_frames(trained: Path) -> None:
+    """Frames by the dataset's index, and by what a device remembers, give the same embeddings."""
+    settings = load_settings(flags=TINY)
+    model = Model.load(trained / "model" / "model.safetensors")
+    assert model.look == (4, 4)
+    assert {"frames": 4, "frame_gap": 4, "photometric": "affine"}.items() <= (
+        model.architecture.items()
+    )
+    split = render(open_dataset(trained / "data", settings).split("train"), settings, QUIET)
+    by_training = embed(model.networks["encoder"], split, settings)
+    by_devices = embed_split(model, settings, "train").z
+    torch.testing.assert_close(by_training, by_devices, atol=1e-4, rtol=1e-4)
+    other = split.seen(1, frames=4, frame_gap=4).unflatten(0, (3, 30))
+    # Of step 20: the frames of steps 8, 12, 16 and 20, which are stored one further on.
+    assert torch.equal(other[:, 20], split.frames[:, [9, 13, 17, 21]])
+
+
+def test_the_loop_closes(trained: Path) -> None:
+    model = Model.load(trained / "model" / "model.safetensors")
+    simulator = Simulator(load_settings(flags=TINY), model)
+    block = Block("hjepa", (Point("gap", 4.0),), 0, 2)
+    outcome = block.compute(simulator, lambda steps: None)
+    assert np.isfinite(outcome.cost).all() and outcome.flagged is not None
+
+
+def test_frames_that_a_device_has_forgotten_are_refused() -> None:
+    for flags, most in (({"encoder.frames": 4, "encoder.frame_gap": 6}, 5),
+                        ({"encoder.frame_gap": 16}, 15)):  # fmt: skip
+        with pytest.raises(UsageError, match=f"choose 1 to {most}"):
+            check_settings(load_settings(flags=flags))
