@@ -28,7 +28,7 @@ from collections.abc import Callable, Sequence
 from multiprocessing.context import BaseContext
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Any
 
 import torch
@@ -53,6 +53,7 @@ from hjepa_cli.storage.shards import LOG
 
 STAGES = ("collect", "train-encoder", "train-hierarchy", "eval", "scale")
 DISK = frozenset("open write flush truncate close __exit__ fsync replace unlink mkdir".split())
+OF_DISK = (ModuleType, io.BufferedIOBase, io.FileIO)  # not locks, which have __exit__ too
 COMPARED = ("*.safetensors", "dataset.json", METRICS, "curves.json", "devices.csv", "config.toml")
 SETTINGS = load_settings(
     flags={
@@ -107,7 +108,7 @@ def run_stage(
 
     def look(frame: FrameType, event: str, called: Any) -> None:
         nonlocal count
-        if event == "c_call" and called.__name__ in DISK:
+        if event == "c_call" and called.__name__ in DISK and isinstance(called.__self__, OF_DISK):
             count += 1
             if count == last:
                 os.kill(os.getpid(), signal.SIGKILL)

@@ -31,17 +31,32 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("kill")
 
 
+@pytest.fixture(scope="module")
+def half_written() -> list[int]:
+    """Return how many half-written files the kills left, stage by stage."""
+    return []
+
+
 @pytest.mark.parametrize("stage", kill.STAGES)
 def test_killed_and_continued_is_whole(
-    stage: str, root: Path, context: BaseContext, monkeypatch: pytest.MonkeyPatch
+    stage: str,
+    root: Path,
+    context: BaseContext,
+    monkeypatch: pytest.MonkeyPatch,
+    half_written: list[int],
 ) -> None:
     monkeypatch.syspath_prepend(REPOSITORY / "benchmarks")
     calls = kill.run_whole(context, stage, root)
     chance = random.Random(stage)
     moments = [chance.random() for _ in range(3)]
     out = root / f"{stage}-killed"
-    killed, _ = kill.kill_stage(context, stage, root, out, calls, moments)
+    killed, writing = kill.kill_stage(context, stage, root, out, calls, moments)
     assert killed == 3
+    half_written.append(writing)
+
+
+def test_some_were_killed_while_they_wrote(half_written: list[int]) -> None:
+    assert len(half_written) == len(kill.STAGES) and sum(half_written) > 0
 
 
 def test_the_comparison_can_fail(root: Path, tmp_path: Path) -> None:
