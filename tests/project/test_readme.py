@@ -80,7 +80,7 @@ def test_scores_in_the_text_are_those_of_the_curves():
     (point,) = [point for point in entries["hjepa"]["gap_curve"] if point["d"] == 80]
     low, high = point["ci95"]
     assert f"{point['score']:.3f} ({low:.3f}–{high:.3f}, 64 devices)" in TEXT
-    page = (ROOT / "docs/metrics.md").read_text()
+    page = (ROOT / "docs/reference/metrics.md").read_text()
     table = rows(page, "| D [steps] | 20")
     for method, row in table.items():
         curve = {point["d"]: point for point in entries[method]["gap_curve"]}
@@ -127,7 +127,7 @@ def test_the_pictures_of_the_documentation_are_drawn_by_the_script(tmp_path):
                   (tmp_path, ROOT / "docs/figures"))  # fmt: skip
     of_several = {"trainings.png", "embedding.png", "training_size.png"}  # not of the zoo's models
     assert made == kept - of_several
-    page = (ROOT / "docs/figures.md").read_text()
+    page = (ROOT / "docs/how-to/figures.md").read_text()
     for name in made:
         assert f"figures/{name}" in page
         pixels = [
