@@ -45,7 +45,7 @@ def test_every_block_is_on_a_page_and_every_mark_is_a_block():
 
 
 def test_a_page_is_mended_and_the_rest_of_it_left_alone():
-    before = "# A\n\n<!-- table: tolerated -->\nold\n<!-- end -->\n\n| b |\n"
+    before = "# A\n\n<!-- table: tolerated -->\nstale\n<!-- end -->\n\n| b |\n"
     after = script.rewritten(before)
     assert after.startswith("# A\n\n<!-- table: tolerated -->\n\n*D") and after.endswith("| b |\n")
-    assert "old" not in after and script.rewritten(after) == after
+    assert "stale" not in after and script.rewritten(after) == after
