@@ -23,7 +23,7 @@ from hjepa_cli.core.statistics import student_interval
 from hjepa_cli.errors import DataError, MissingInputError, UsageError, require, shell
 from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.plugins import METHODS
-from hjepa_cli.stages.report import NO_RESULT, found_runs, inputs_of, stage_of
+from hjepa_cli.stages.report import NO_RESULT, found_runs, stage_of
 from hjepa_cli.stages.results import check_config
 from hjepa_cli.storage import runs
 
@@ -158,11 +158,12 @@ def open_evaluation(directory: Path, methods: Sequence[str] | None) -> Evaluatio
     check_config("eval", config, directory)
     environment = runs.read_environment(directory)
     if reason := flaw(result, config):
-        again = ["hjepa", "eval", "--config", str(directory / runs.CONFIG)]
-        again += [*inputs_of(environment), "--out", f"{directory}-again", "--remeasure"]
+        again = runs.anew(environment, directory / runs.CONFIG)
+        given = () if environment["inputs"].get("remeasure") is True else ("--remeasure",)
+        again += f" {shell([*given, '--out', f'{directory}-again'])}"
         raise DataError(
             f"{directory / runs.RESULT}: {reason}",
-            hint=f"leave it out, or in its place: {shell(again)}",
+            hint=f"leave it out, or in its place: {again}",
         )
     all_of = result["methods"]
     entries = {name: all_of[name] for name in all_of if methods is None or name in methods}

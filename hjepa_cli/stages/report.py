@@ -155,26 +155,10 @@ def describe(directory: Path) -> dict[str, Any]:
         "result": result,
         "config": settings,
         "command": shell(["hjepa", *map(str, environment.get("command", [])[1:])]),
-        "again": shell(["hjepa", stage, "--config", str(config), *inputs_of(environment)]),
+        "again": runs.anew(environment, config),
         "environment": versions | {key: environment.get(key) for key in MACHINE},
         "toml": files.read_bytes(config, limit=files.JSON_LIMIT_BYTES).decode(),
     }
-
-
-def inputs_of(environment: Mapping[str, Any]) -> list[str]:
-    """Return what a run was given as flags; paths below this directory without it.
-
-    Further models (``checkpoint 2``) have no flag: the command finds them again.
-    """
-    flags = []
-    for name, given in environment["inputs"].items():
-        if " " not in name and isinstance(given, dict) and isinstance(given.get("path"), str):
-            path = Path(given["path"])
-            here = path.is_relative_to(Path.cwd())
-            flags += [f"--{name}", str(path.relative_to(Path.cwd()) if here else path)]
-        elif isinstance(given, float):
-            flags += [f"--{name.replace('_', '-')}", f"{given:g}"]
-    return flags
 
 
 def stage_of(directory: Path) -> str:

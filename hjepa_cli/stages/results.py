@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, UsageError, shell
+from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.storage import runs
 
@@ -322,7 +322,7 @@ def damaged(directory: Path, stage: str, reason: object, name: str = runs.RESULT
     """Return the error of a run whose file is not what its stage writes."""
     return DataError(
         f"{directory / name} lacks what a {stage} run has: {reason}",
-        hint=shell(["hjepa", stage, "--config", directory / runs.CONFIG]),
+        hint=runs.anew(runs.read_environment(directory), directory / runs.CONFIG),
     )
 
 

@@ -1,7 +1,7 @@
 """``hjepa tune-law`` searches a control law that is good at sparse packets.
 
 Settings → ``law.toml`` with the law that models learn and the one of method ``ceiling``. The laws
-of shipped plants come with the package (``hjepa_cli/config/laws.toml``).
+of shipped plants come with the package (``hjepa_cli/config/control_laws.toml``).
 """
 
 import time

@@ -427,13 +427,28 @@ def anew(recorded: Mapping[str, Any], config: Path | None = None) -> str:
     """Return the command of a recorded run: its settings in a file, its plugins and inputs."""
     words = [recorded["stage"], *(["--config", str(config)] if config else [])]
     words += _named(Source(one["name"], one["sha256"]) for one in recorded["plugins"])
-    for name, value in recorded["inputs"].items():
+    return f"hjepa {shell([*words, *inputs_of(recorded)])}"
+
+
+def inputs_of(recorded: Mapping[str, Any]) -> list[str]:
+    """Return what a recorded run was given as flags; paths below this directory without it.
+
+    Further models (``checkpoint 2``) have no flag: the command finds them again.
+    """
+    words = []
+    for name, given in recorded["inputs"].items():
         flag = f"--{name.replace('_', '-')}"
-        if value is True:
+        if isinstance(given, Mapping) and isinstance(given.get("path"), str) and " " not in name:
+            path = Path(given["path"])
+            here = path.is_relative_to(Path.cwd())
+            words += [flag, str(path.relative_to(Path.cwd()) if here else path)]
+        elif given is True:
             words.append(flag)
-        elif isinstance(value, Mapping) and " " not in name:  # of several models the first
-            words += [flag, str(value.get("path"))]
-    return f"hjepa {shell(words)}"
+        elif isinstance(given, float | int) and given is not False:
+            words += [flag, f"{given:.15g}"]
+        elif isinstance(given, str):
+            words += [flag, given]
+    return words
 
 
 def _named(plugins: Iterable[Source]) -> list[str]:

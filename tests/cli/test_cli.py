@@ -443,7 +443,7 @@ EXPECTED = [
     (KeyboardInterrupt(), 130),
     (ZeroDivisionError("division by zero"), 1),
     (RuntimeError("first\nsecond\x1b[31m"), 1),
-    (MemoryError(), 1),
+    (MemoryError(), 70),
 ]
 
 

@@ -361,6 +361,8 @@ def test_a_scheduler_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_hints_to_repeat_name_the_command_that_goes_on() -> None:
     """The same command without --out would begin again elsewhere."""
+    Path("data").mkdir()
+    Path("data", collect.LOG).touch()
     with pytest.raises(NumericalError) as caught, collect.telling_how_to_go_on(Path("data")):
         with executors.broken_pool_reported():
             raise executors.BrokenProcessPool

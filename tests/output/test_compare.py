@@ -185,7 +185,7 @@ def test_a_run_of_an_older_version_says_how_to_measure_it_again(shell):
     reseal(old / "result.json", document)
     outcome = shell("compare")
     assert_one_line_error(outcome, 65, "older version")
-    assert "hjepa eval --config runs/eval/seed-1/config.toml --out" in outcome.err
+    assert "hjepa eval --config runs/eval/seed-1/config.toml --remeasure --out" in outcome.err
 
 
 def test_the_order_is_that_of_the_methods_not_of_files(shell):

@@ -12,6 +12,7 @@ from command_line import assert_one_line_error, open_shell
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.stages import report
+from hjepa_cli.storage import runs
 from hjepa_cli.storage.runs import Run
 
 pytest.importorskip("matplotlib")
@@ -70,9 +71,9 @@ def entry(score):
     }
 
 
-def finished(stage, result, metrics=(), name=None):
-    settings = load_settings().as_dict()
-    with Run.create(stage, Path("runs") / stage / name if name else None, settings) as record:
+def finished(stage, result, metrics=(), name=None, inputs=None):
+    settings, out = load_settings().as_dict(), Path("runs") / stage / name if name else None
+    with Run.create(stage, out, settings, inputs) as record:
         for row in metrics:
             record.metric(row)
         record.finish(result)
@@ -202,7 +203,7 @@ def test_the_commands_name_what_the_run_was_given(shell, without_figures):
 def test_further_models_have_no_flag(shell):
     """Each method's model is looked for again: `hjepa eval` takes one --checkpoint."""
     given = {name: {"path": f"/{name}"} for name in ("checkpoint", "checkpoint 2", "checkpoint 3")}
-    assert report.inputs_of({"inputs": given}) == ["--checkpoint", "/checkpoint"]
+    assert runs.inputs_of({"inputs": given}) == ["--checkpoint", "/checkpoint"]
 
 
 def test_a_smoke_run_is_called_one(shell, without_figures):
@@ -413,7 +414,11 @@ def test_a_run_over_the_wire_has_its_section(shell):
     "change", [{"ages": {"0": "many"}}, {"score_link": None}, {"period_ms": "slow"}]
 )
 def test_a_damaged_run_over_the_wire_is_refused(shell, change):
-    made = finished("bench-link", WIRE | change)
+    made = finished(
+        "bench-link",
+        WIRE | change,
+        inputs={"model": {"path": "exported", "sha256": "0"}, "gap": 80},
+    )
     assert_one_line_error(shell("report", made), 65, "lacks what a bench-link run has")
 
 
