@@ -41,7 +41,15 @@ def test_every_block_is_on_a_page_and_every_mark_is_a_block():
     assert len(set(blocks())) == len(blocks())
     for page in script.pages():
         text = page.read_text(encoding="utf-8")
-        assert len(re.findall("<!-- table:", text)) == len(script.BLOCK.findall(text)), page
+        assert len(re.findall("^<!-- table:", text, re.MULTILINE)) == len(
+            script.BLOCK.findall(text)
+        ), page
+
+
+def test_five_trainings_are_five():
+    kept, paired = script.trainings()
+    assert {"hjepa", "oracle", "hold", "chunk"} <= kept.keys() and len(paired) == len(kept) - 1
+    assert all(len(by_seed) == 5 for by_seed in kept.values())
 
 
 def test_a_page_is_mended_and_the_rest_of_it_left_alone():
