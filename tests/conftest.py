@@ -4,8 +4,8 @@ import signal
 
 from hypothesis import settings
 
-# A shell's background jobs ignore Ctrl-C, those of nohup the end of the terminal, and so would every
-# process that a test starts.
+# A shell's background jobs ignore Ctrl-C, those of nohup the end of the terminal, and so would
+# every process that a test starts.
 for number, handler in (
     (signal.SIGINT, signal.default_int_handler),
     (signal.SIGHUP, signal.SIG_DFL),

@@ -405,17 +405,16 @@ class ControlSettings:
 
 @dataclasses.dataclass(frozen=True)
 class TuneSettings:
-    """``tune-law`` searches both laws on the true state.
-
-    Errors are standard deviations in units of those that states have under the teacher.
-    """
+    """``tune-law`` searches both laws on the true state."""
 
     devices: Count = 24
     steps: Count = 2000  # scored, after the protocol's warm-up
     candidates: Candidates = 12
     rounds: Count = 24
-    packet_error: NotNegative = 0.05  # of the state that a packet tells
-    actor_error: NotNegative = 0.2  # of the state that the law sees, anew at every step
+    # Standard deviation of what a packet tells, ÷ that of states under the teacher.
+    packet_error: NotNegative = 0.05
+    # What an actor has to learn is charged: so much score for root mean square forces at the limit.
+    force_price: NotNegative = 0.4
 
 
 @dataclasses.dataclass(frozen=True)

@@ -42,8 +42,16 @@ def begin(
     modules = untrained(architecture, settings)
     for name in taken:
         modules[name].load_state_dict(trained[name].state_dict())
+        round_weights(modules[name])
     modules["encoder"].requires_grad_(False).eval()
     return modules.to(resolve_device(settings.device))
+
+
+@torch.no_grad()
+def round_weights(module: nn.Module) -> None:
+    """Round weights to bfloat16, which most machines compute with: half the bytes in a file."""
+    for weights in module.parameters():
+        weights.copy_(weights.bfloat16())
 
 
 def plan_embedding(settings: Settings, frames: int) -> tuple[str, dict[str, float]]:
@@ -178,7 +186,8 @@ def fit_actor_to(
 
 def save(run: TrainingRun, modules: nn.ModuleDict, metadata: dict[str, Any]) -> Model:
     """Keep the checkpoint of a run, and return it as the model that drives."""
-    digest = save_checkpoint(run.record.path(MODEL_FILE), tensors_of(modules), metadata)
+    path = run.record.path(MODEL_FILE)
+    digest = save_checkpoint(path, tensors_of(modules), metadata, narrow=True)
     return Model(modules, metadata, digest, run.settings.device)
 
 

@@ -23,7 +23,7 @@ from hjepa_cli.core.training.optimiser import Optimiser, name_samples
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_fusion
-from hjepa_cli.stages.embedding_training import begin, fit_network, save
+from hjepa_cli.stages.embedding_training import begin, fit_network, round_weights, save
 from hjepa_cli.stages.inputs import brought_along, open_dataset, refuse_recorded
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.train_reflex import open_model
@@ -135,6 +135,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     for number in range(options.rounds):
         train_round(run, modules, model, number)
     del modules["before"]
+    round_weights(modules)
     heard = listen(model, modules["posterior"], settings, options.rounds)
     save(run, modules, metadata)
     found = examine(modules["posterior"], heard)

@@ -40,6 +40,7 @@ from hjepa_cli.stages.embedding_training import (
     fit_network,
     nmae_windows,
     plan_embedding,
+    round_weights,
     save,
 )
 from hjepa_cli.stages.inputs import (
@@ -155,6 +156,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
         fit_actor_to(modules, "actor", join(views).z.flatten(0, 1), labels, architecture, settings)
     train_levels(run, modules, architecture, views, shared)
 
+    round_weights(modules)
     h = architecture["h"]
     examined = source.metadata["health"] | examine(modules, test, h, settings)
     model = save(run, modules, run.metadata(architecture, encoder=source.digest, health=examined))

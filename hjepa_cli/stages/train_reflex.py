@@ -43,6 +43,7 @@ from hjepa_cli.stages.embedding_training import (
     fit_network,
     nmae_windows,
     plan_embedding,
+    round_weights,
     save,
     views_of,
 )
@@ -162,6 +163,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     law, trial, reflex = search_laws(settings, screen)
     labels = labels_of_law(plant_of(settings), law, starts, sides)
     fit_actor_to(modules, "law", z, labels, architecture, settings)
+    round_weights(modules)
     metadata = run.metadata(
         architecture, encoder=source.digest, health=source.metadata["health"], reflex=reflex
     )

@@ -49,7 +49,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             "plant": kind.name,
             "seed": settings.seed,
             "gaps": search.trial.gaps.tolist(),
-            "scores": {name: search.scores(one[None])[0].tolist() for name, one in found.items()},
+            "scores": {name: search.drive(one[None])[0][0].tolist() for name, one in found.items()},
             **{name: gains.tolist() for name, gains in found.items()},
             "law": str(record.path(LAW)),
             "seconds": time.perf_counter() - began,

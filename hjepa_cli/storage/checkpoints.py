@@ -40,9 +40,15 @@ class Checkpoint:
 
 
 def save_checkpoint(
-    path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, Any]
+    path: Path,
+    tensors: Mapping[str, np.ndarray],
+    metadata: Mapping[str, Any],
+    *,
+    narrow: bool = False,
 ) -> str:
     """Write float32 or int64 arrays and plain JSON data atomically, and return their sha256.
+
+    ``narrow``: see :func:`~hjepa_cli.storage.tensors.pack`; the sha256 is the same.
 
     Raises:
         NumericalError: a tensor or the metadata holds NaN or an infinity.
@@ -58,7 +64,7 @@ def save_checkpoint(
     except ValueError as error:
         raise NumericalError(f"refusing to write {path}: metadata: {error}") from None
     sealed = seals.sealed({**metadata, "schema": SCHEMA}, tensors)
-    write_bytes(path, arrays.pack(tensors, canonical_json(sealed)))
+    write_bytes(path, arrays.pack(tensors, canonical_json(sealed), narrow=narrow))
     return str(sealed[seals.SEAL])
 
 

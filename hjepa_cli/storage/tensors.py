@@ -7,9 +7,10 @@ key makes the bytes random. All array files of this program therefore pass throu
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
+from safetensors import SafetensorError, deserialize
 from safetensors import numpy as safetensors_numpy
 
 from hjepa_cli.errors import DataError
@@ -18,6 +19,7 @@ from hjepa_cli.storage.files import parse_json
 METADATA_KEY = "hjepa"
 HEADER_LIMIT_BYTES = 2**20
 DTYPES = ("float32", "int64", "uint8")
+STORED = {"F32": "<f4", "BF16": "<u2", "I64": "<i8", "U8": "u1"}
 
 Shapes = Mapping[str, tuple[str, tuple[int, ...]]]
 """It maps names of tensors to dtype and shape."""
@@ -33,16 +35,20 @@ _MALFORMED = (
 )
 
 
-def pack(tensors: Mapping[str, np.ndarray], metadata: str | None = None) -> bytes:
+def pack(
+    tensors: Mapping[str, np.ndarray], metadata: str | None = None, *, narrow: bool = False
+) -> bytes:
     """Return the safetensors file holding ``tensors`` and the text ``metadata``.
 
-    Equal arrays give equal bytes, whatever their strides or byte order.
+    Equal arrays give equal bytes, whatever their strides or byte order. ``narrow`` stores float32
+    arrays that fit bfloat16 exactly as such, in half the bytes; :func:`unpack` widens them again.
 
     Raises:
         ValueError: a dtype other than :data:`DTYPES`, or more text than :func:`unpack` accepts.
     """
     plain = {name: plain_array(array, name) for name, array in tensors.items()}
-    data = safetensors_numpy.save(plain, None if metadata is None else {METADATA_KEY: metadata})
+    texts = None if metadata is None else {METADATA_KEY: metadata}
+    data = _save_narrow(plain, texts) if narrow else safetensors_numpy.save(plain, texts)
     if (length := int.from_bytes(data[:8], "little")) > HEADER_LIMIT_BYTES:
         raise ValueError(f"a header of {length} bytes; readers accept {HEADER_LIMIT_BYTES}")
     return data
@@ -62,13 +68,32 @@ def unpack(data: bytes, path: Path) -> tuple[dict[str, np.ndarray], str | None]:
             raise ValueError("the header is longer than the file or the limit")
         header = parse_json(data[8 : 8 + length])
         foreign = {entry["dtype"] for name, entry in header.items() if name != "__metadata__"}
-        if foreign - {"F32", "I64", "U8"}:
+        if foreign - STORED.keys():
             raise ValueError(f"unexpected dtype {', '.join(sorted(foreign))}")
         metadata = header.get("__metadata__", {}).get(METADATA_KEY)
-        return safetensors_numpy.load(data), metadata
+        return {name: _widened(stored) for name, stored in deserialize(data)}, metadata
     except _MALFORMED as error:
         reason = str(error).partition("\n")[0]
         raise DataError(f"{path} is damaged or not a safetensors file: {reason}") from None
+
+
+def _save_narrow(tensors: Mapping[str, np.ndarray], texts: dict[str, str] | None) -> bytes:
+    import torch  # knows bfloat16, which numpy does not
+    from safetensors import torch as safetensors_torch
+
+    stored = {}
+    for name, array in tensors.items():
+        stored[name] = whole = torch.from_numpy(array)
+        if whole.dtype == torch.float32 and torch.equal(whole.bfloat16().float(), whole):
+            stored[name] = whole.bfloat16()
+    return safetensors_torch.save(stored, texts)
+
+
+def _widened(stored: Mapping[str, Any]) -> np.ndarray:
+    array = np.frombuffer(stored["data"], STORED[stored["dtype"]]).reshape(stored["shape"])
+    if stored["dtype"] == "BF16":  # the upper half of a float32
+        return (array.astype("<u4") << 16).view("<f4").astype(np.float32, copy=False)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
 def check_header(path: Path) -> None:

@@ -120,8 +120,10 @@ def test_the_hierarchy_takes_the_encoder_as_it_is(workplace: Path) -> None:
     model = train(workplace, "hierarchy")
     source = networks(workplace / "encoder")
     taken = networks(workplace / "hierarchy")["encoder"].state_dict()
+    weights = {name for name, _ in source["encoder"].named_parameters()}
     for name, tensor in source["encoder"].state_dict().items():
-        assert torch.equal(taken[name], tensor), name
+        rounded = tensor.bfloat16().float() if name in weights else tensor
+        assert torch.equal(taken[name], rounded), name
     assert methods_of(model) == ("hjepa", "ts-jepa-4", "ts-jepa-1", "hold", "zero", *FITTED)
     with (workplace / "hierarchy" / "metrics.csv").open() as lines:
         assert {row["level"] for row in csv.DictReader(lines)} == {"high", "medium", "low", "flat"}
@@ -165,8 +167,8 @@ def test_the_companion_is_the_start_of_the_high_level_where_h_agrees(workplace: 
     source = networks(workplace / "encoder")
     train(workplace, "from-companion", **frozen)
     started = networks(workplace / "from-companion")["high"].state_dict()
-    for name, tensor in source["high"].state_dict().items():
-        assert torch.equal(started[name], tensor), name
+    for name, weights in source["high"].named_parameters():
+        assert torch.equal(started[name], weights.bfloat16().float()), name
     # The P^H of a hierarchy is trained already: on its encoder another one starts from nothing.
     again = train_hierarchy.run(
         settings(**frozen),

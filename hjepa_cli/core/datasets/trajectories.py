@@ -11,6 +11,9 @@ from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant
 
 STREAM = 1  # this stage's branch of the seed tree
+# Trajectories that a tuned law drives: how far from rest they start and how wrong the belief is
+# that it goes by, ÷ the half widths of other starts, and when a packet comes, ÷ their length.
+START, BELIEF, PACKET = 0.5, 0.3, (0.2, 0.8)
 SPLITS = ("train", "test", "clean")
 
 
@@ -28,10 +31,13 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
 
     One step without force leads from the drawn state to k = 0, because the camera needs a frame
     before it. The applied force is the law's plus exploration, clipped; the label is the law's
-    alone. A tuned law leaves little to see, since it is quick to bring a device to rest: where
-    there is one, the plant's own teacher drives every second trajectory. ``clean`` has no
-    exploration, and devices as ``conditions`` have them. Trajectory i does not depend on how many
-    there are.
+    alone, in the true state. ``clean`` has no exploration, and devices as ``conditions`` have them.
+    Trajectory i does not depend on how many there are.
+
+    A tuned law is quick to bring a device to rest, which leaves little to see, and throws devices
+    about that are far from it. Where there is one, the plant's own teacher drives every second
+    trajectory. The law drives the others, from nearer starts, and from a belief that is wrong until
+    a packet comes: forces that do not fit the state are what a controller plays in closed loop.
     """
     kind, clean = plant(settings.plant), split == "clean"
     size, steps = split_sizes(settings.collect)[split]
@@ -39,15 +45,18 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     streams = (generator(settings.seed, STREAM, SPLITS.index(split), i) for i in indices)
     shape = (steps, *kind.action_shape)
     draws = [_draw(settings.collect, random, shape, clean) for random in streams]
-    initial, exploration_n = (np.stack(parts) for parts in zip(*draws, strict=True))
+    initial, exploration_n, wrong, packet = (np.stack(parts) for parts in zip(*draws, strict=True))
     count = len(initial)
 
     # Methods are measured on clean rollouts.
     moved = actual_plant(settings.plant, settings.conditions) if clean else kind
     law_n, own_n = control_law(kind, settings.control), kind.teacher()
-    simulation, by_teacher = moved.simulation(count), np.zeros(count, bool)
+    simulation, by_law = moved.simulation(count), np.zeros(count, bool)
     if law_n is not own_n and not clean:
-        by_teacher = np.arange(indices.start, indices.stop) % 2 == 1
+        by_law = np.arange(indices.start, indices.stop) % 2 == 0
+    initial[by_law] *= START
+    if driven := by_law.sum():
+        believed = kind.advance(initial[by_law] + wrong[by_law], kind.no_force(driven))
     simulation.states = initial
     states = np.empty((count, steps + 1, len(kind.state_names)))
     applied_n, teacher_n = np.empty((2, count, steps, *kind.action_shape))
@@ -56,23 +65,32 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     for k in range(steps):
         states[:, k + 1] = simulation.states
         teacher_n[:, k] = driven_n = law_n(states[:, k + 1])
-        if by_teacher.any():
-            driven_n = driven_n.copy()
-            driven_n[by_teacher] = own_n(states[by_teacher, k + 1])
+        if driven:
+            driven_n = np.array(own_n(states[:, k + 1]))
+            heard = k == packet[by_law]
+            believed[heard] = states[by_law][heard, k + 1]
+            driven_n[by_law] = law_n(believed)
         applied_n[:, k] = driven_n + exploration_n[:, k]
         applied_n[:, k] = applied_n[:, k].clip(-kind.force_limit_n, kind.force_limit_n)
+        if driven:
+            believed = kind.advance(believed, applied_n[by_law, k])
         simulation.step(applied_n[:, k])
     return Trajectories(*(array.astype(np.float32) for array in (states, applied_n, teacher_n)))
 
 
 def _draw(
     collect: CollectSettings, random: np.random.Generator, shape: tuple[int, ...], clean: bool
-) -> tuple[Floats, Floats]:
-    """Draw one trajectory's initial state ``[S]`` and piecewise constant pushes ``[steps, *A]``."""
+) -> tuple[Floats, Floats, Floats, int]:
+    """Draw one trajectory's initial state [S] and piecewise constant pushes [steps, *A].
+
+    And what only a tuned law has: how wrong its belief [S] starts, and the step that tells it.
+    """
     half_widths = np.array(collect.half_widths)
     initial = random.uniform(-1, 1, half_widths.size) * half_widths
-    if clean:
-        return initial, np.zeros(shape)
     (steps, *action), hold = shape, collect.exploration_hold_steps
+    if clean:
+        return initial, np.zeros(shape), np.zeros_like(initial), 0
     pushes_n = random.normal(0.0, collect.exploration_n, (-(-steps // hold), *action))
-    return initial, np.repeat(pushes_n, hold, axis=0)[:steps]
+    wrong = BELIEF * random.uniform(-1, 1, half_widths.size) * half_widths
+    packet = int(steps * random.uniform(*PACKET))
+    return initial, np.repeat(pushes_n, hold, axis=0)[:steps], wrong, packet

@@ -2,8 +2,8 @@
 
 Gains K of u = −K x are factors of the teacher's own gains at rest. A candidate drives devices from
 the true state, rolled forward by the plant's exact equations between packets, as method ``oracle``
-does. What it learns from a packet is a little wrong, and so is what an actor sees of it at every
-step: a law that only a perfect actor can play would be of no use to one that learned it.
+does. What it learns from a packet is a little wrong, and force has a price: an actor's errors grow
+with the forces that it has to learn, and violent motion is hard to predict.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ class LawSearch:
     Attributes:
         trial: devices and gaps, the same for all candidates.
         rest: standard deviations [S] of the states that the teacher holds, the unit of errors.
-        options: how many candidates, rounds and errors.
+        options: how many candidates and rounds, and what errors and forces are.
         seed: of the search.
     """
 
@@ -61,16 +61,20 @@ class LawSearch:
         return dataclasses.replace(search, rest=search._rest())
 
     def gains_n(self, *, learnable: bool) -> Floats:
-        """Search K [F, S]; for an actor that errs if ``learnable``, else for one that does not."""
+        """Search K [F, S]; one with a price on forces if ``learnable``, else without."""
         kind, options = self.trial.kind, self.options
         own_n = gains_at_rest(kind.teacher(), len(kind.state_names))
-        actor_error = options.actor_error if learnable else 0.0
+        price = options.force_price / kind.force_limit_n if learnable else 0.0
 
         def laws(factors: Floats) -> Floats:
             return np.asarray(own_n * np.exp(factors).reshape(-1, *own_n.shape))
 
+        def worth(factors: Floats) -> Floats:
+            scores, forces_n = self.drive(laws(factors))
+            return np.asarray((scores - price * forces_n).mean(axis=1))
+
         found = best(
-            lambda factors: self.scores(laws(factors), actor_error).mean(axis=1),
+            worth,
             np.zeros(own_n.size),
             np.full(own_n.size, SPREAD),
             candidates=options.candidates,
@@ -79,32 +83,34 @@ class LawSearch:
         )
         return np.asarray(laws(found[None])[0])
 
-    def scores(self, gains_n: Floats, actor_error: float = 0.0) -> Floats:
-        """Return the scores [C, G] of laws K [C, F, S] over the gaps, in the teacher's."""
+    def drive(self, gains_n: Floats) -> tuple[Floats, Floats]:
+        """Drive devices with laws K [C, F, S] at every gap.
+
+        Returns:
+            Scores [C, G] in the teacher's, and root mean square forces [C, G] in newton.
+        """
         kind, draws, schedules = self.trial.kind, self.trial.draws, self.trial.schedules
         law = LinearLaw(gains_n[:, None, None], kind.force_limit_n, kind.action_shape)
         shape = len(gains_n), len(self.trial.gaps), draws.devices
-        random = generator(self.seed, NOISE_KEY)
-
-        def erring(states: Floats, error: float) -> Floats:
-            if not error:
-                return states
-            return states + error * self.rest * random.standard_normal(states.shape[1:])
+        random, error = generator(self.seed, NOISE_KEY), self.options.packet_error * self.rest
 
         initial = np.broadcast_to(draws.initial, (*shape, draws.initial.shape[1]))
         states = kind.advance(initial, np.zeros((*shape, *kind.action_shape)))
-        believed, inside = states, np.zeros(shape)
+        believed, inside, squares = states, np.zeros(shape), np.zeros(shape)
         for k in range(draws.steps):
             if (heard := schedules[:, k]).any():
-                told = erring(states, self.options.packet_error)
+                told = states + error * random.standard_normal(states.shape[1:])
                 believed = np.where(heard[..., None], told, believed)
+            forces_n = law(believed)
             if k >= draws.warmup_steps:
                 inside += kind.in_band(states)
-            forces_n = law(erring(believed, actor_error))
+                squares += (forces_n**2).reshape(*shape, -1).mean(axis=-1)
             believed = kind.advance(believed, forces_n).clip(-STATE_LIMIT, STATE_LIMIT)
             states = kind.advance(states, forces_n) + draws.noise[k]
             states = states.clip(-STATE_LIMIT, STATE_LIMIT)
-        return ratio(inside / (draws.steps - draws.warmup_steps), self.trial.teacher)
+        scored = draws.steps - draws.warmup_steps
+        scores = ratio(inside / scored, self.trial.teacher)
+        return scores, np.sqrt(squares.mean(axis=-1) / scored)
 
     def _rest(self) -> Floats:
         """Return the spread of each state over scored steps and devices, under the teacher."""
