@@ -204,8 +204,6 @@ class AugmentSettings:
     jitter_px: NotNegative = 0.12  # standard deviation, anew in every frame
     rotation_deg: NotNegative = 2.5
     rectangle_px: NotNegative = 16.0  # side, of any grey
-    # Of training pictures once more, with clean labels, for actor and predictors.
-    copies: CountOrNone = 2
 
 
 @dataclasses.dataclass(frozen=True)

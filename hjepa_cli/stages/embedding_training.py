@@ -20,7 +20,6 @@ from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks.model import Model, tensors_of
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant_of
-from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, fit_actor
 from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
@@ -30,7 +29,6 @@ from hjepa_cli.stages.training import Architecture, Drawn, TrainingRun, untraine
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 
 STREAM = 3  # of the shifts, and of train-hierarchy, in the seed tree
-AUGMENTED = 9  # of STREAM; its levels have 1 to 4
 REPORT_EVERY = 50  # steps between rows of metrics.csv
 
 
@@ -68,8 +66,7 @@ def embed_all(
     """Return embeddings and labels [N, T, *A] of the training pictures and of shifted copies.
 
     In a copy every trajectory is moved sideways by up to ``encoder.shift_px``, and the labels are
-    what the teacher does there. With ``flip`` all of these are there in the mirror too. Copies of
-    these that are augmented come last, with the labels and the embeddings of clean ones.
+    what the teacher does there. With ``flip`` all of these are there in the mirror too.
     """
     device, kind, count = resolve_device(settings.device), plant_of(settings), len(train.frames)
     act, mirror = control_law(kind, settings.control), torch.tensor(kind.mirror)
@@ -87,12 +84,9 @@ def embed_all(
                 *(encoder, train, settings),
                 mirrored=view.mirrored,
                 shifts_px=view.shifts_px if view.shifts_px.any() else None,
-                seeds=view.seeds,
                 advance=bar.advance,
             )
-            clean = None if view.seeds is None else seen[view.of][0].z
-            embedded = EmbeddedTrajectories(z.to(device), actions.to(device), clean)
-            seen.append((embedded, labels))
+            seen.append((EmbeddedTrajectories(z.to(device), actions.to(device)), labels))
     return seen
 
 
@@ -103,14 +97,10 @@ class View:
     Attributes:
         mirrored: whether in the mirror.
         shifts_px: how far right each trajectory is [N].
-        seeds: of the augmentation of each [N]; ``None`` where it is clean.
-        of: the number of the clean view that it is an augmented copy of.
     """
 
     mirrored: bool
     shifts_px: NDArray[np.int64]
-    seeds: list[int] | None = None
-    of: int = 0
 
     @property
     def before_px(self) -> NDArray[np.int64]:
@@ -122,19 +112,13 @@ class View:
 def views_of(settings: Settings, count: int, *, flip: bool) -> list[View]:
     """Return the views of ``count`` trajectories in training.
 
-    They are as they are, shifted, all of these in the mirror, and augmented copies of these.
+    They are as they are, shifted, and all of these in the mirror.
     """
     farthest = settings.encoder.shift_px
     copies = settings.hierarchy.shifted_copies if farthest else 0
     drawn = generator(settings.seed, STREAM, 0).integers(-farthest, farthest + 1, (copies, count))
     shifts = (np.zeros(count, dtype=np.int64), *drawn)
-    clean = [View(mirrored, moved) for mirrored in (False, True)[: 1 + flip] for moved in shifts]
-    augment, stream = Augmentation(settings.augment), generator(settings.seed, STREAM, AUGMENTED)
-    copies = (settings.augment.copies if augment.on else 0) * (1 + flip)
-    sources = [copy * len(clean) // copies for copy in range(copies)]
-    return clean + [
-        dataclasses.replace(clean[of], seeds=augment.draw(count, stream), of=of) for of in sources
-    ]
+    return [View(mirrored, moved) for mirrored in (False, True)[: 1 + flip] for moved in shifts]
 
 
 def fit_network(

@@ -26,7 +26,6 @@ from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, plant_of
 from hjepa_cli.core.plants.system import same_camera
-from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import shift_sideways
 from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
@@ -44,7 +43,6 @@ def embed(
     look: tuple[int, int] | None = None,
     mirrored: bool = False,
     shifts_px: NDArray[np.int64] | None = None,
-    seeds: list[int] | None = None,
     advance: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
     """Return frozen embeddings [N, K, D] of k = 0, ``every``, …
@@ -53,10 +51,10 @@ def embed(
     says so itself.
 
     ``mirrored`` takes the frames' mirror images; each trajectory is then moved right by
-    ``shifts_px`` [N], and augmented by ``seeds`` [N].
+    ``shifts_px`` [N].
     """
     device = resolve_device(settings.device)
-    precision, augment = settings.encoder.precision, Augmentation(settings.augment)
+    precision = settings.encoder.precision
     frames, frame_gap = look or getattr(encoder, "look", (2, 1))
     parts = []
     for start in range(0, len(split.frames), CHUNK):
@@ -66,8 +64,6 @@ def embed(
             by_trajectory = seen.unflatten(0, (len(part.frames), -1))
             moved = zip(by_trajectory, shifts_px[start : start + CHUNK].tolist(), strict=True)
             seen = torch.cat([shift_sideways(frames, shift_px) for frames, shift_px in moved])
-        if seeds is not None:
-            seen = augment(seen, seeds[start : start + CHUNK])
         z = encode_frames(encoder, seen, device=device, precision=precision)
         parts.append(z.unflatten(0, (len(part.frames), -1)))
         advance(len(part.frames))

@@ -340,8 +340,6 @@ def draw_batch(
 
 def join(views: list[EmbeddedTrajectories]) -> EmbeddedTrajectories:
     """Return all views of the trajectories as one set."""
-    clean = None
-    if any(view.clean is not None for view in views):
-        clean = torch.cat([view.targets for view in views])
-    z, actions = (torch.cat([getattr(view, name) for view in views]) for name in ("z", "actions"))
-    return EmbeddedTrajectories(z, actions, clean)
+    return EmbeddedTrajectories(
+        *(torch.cat([getattr(view, name) for view in views]) for name in ("z", "actions"))
+    )

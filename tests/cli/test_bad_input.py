@@ -69,7 +69,7 @@ def test_h_alone_means_one_level_and_with_m_or_l_the_preset_has_the_rest(shell):
 @pytest.mark.parametrize(
     ("method", "frames", "says"),
     [
-        ("jepa", 4, "method jepa takes 2"),
+        ("jepa", 3, "method jepa takes 2 or 4"),
         ("supervised", 3, "method supervised takes 2 or 4"),
         ("autoencoder", 4, "method autoencoder takes 2"),
     ],

@@ -236,7 +236,7 @@ def test_config_show_names_the_origin_of_every_value(shell):
 def sections():
     """All values of the settings by section."""
     found = {}
-    for key, value in load_settings().as_dict().items():
+    for key, value in load_settings().as_dict(complete=True).items():
         if key != "preset":
             found[key] = value if isinstance(value, dict) else {key: value}
     return found

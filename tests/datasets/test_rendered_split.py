@@ -226,7 +226,7 @@ def test_the_closed_loop_encodes_the_same_pairs(
     recorded: Trajectories, split: RenderedSplit
 ) -> None:
     class Spy:
-        camera, device, frames = plant("desktop").camera(), "cpu", 2
+        camera, device, look = plant("desktop").camera(), "cpu", (2, 1)
 
         def encode(self, frames: np.ndarray) -> Tensor:
             self.shown = torch.from_numpy(frames)

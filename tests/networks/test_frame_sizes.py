@@ -3,11 +3,13 @@
 import pytest
 import torch
 
-from hjepa_cli.config.schema import CameraSettings, Settings
+from hjepa_cli.config.schema import AugmentSettings, CameraSettings, Settings
 from hjepa_cli.core.networks.decoder import Decoder
 from hjepa_cli.core.networks.encoder import Encoder, map_of, stages_of
+from hjepa_cli.core.networks.photometry import against_background
 from hjepa_cli.core.networks.symmetry import reflect
 from hjepa_cli.core.plants.frames import FRAME_SHAPE
+from hjepa_cli.core.training.augmentation import Augmentation
 
 SIZES = [(64, 128, 3), (48, 96, 3), (32, 32, 1), (50, 70, 3), (17, 40, 1), (120, 160, 1)]
 
@@ -36,6 +38,25 @@ def test_embeddings_of_mirrored_pictures_are_reflected(shape):
     changed[:, :, -1, -1] = 255 - changed[:, :, -1, -1]
     with torch.no_grad():
         assert not torch.allclose(encoder(changed), z, atol=1e-6)
+
+
+@pytest.mark.parametrize("fit", ["gain", "affine"])
+@pytest.mark.parametrize("shape", SIZES, ids=str)
+def test_pictures_of_any_size_are_fitted_to_their_background(shape, fit):
+    """Of a scene that is mostly background, light does not matter: to float32's last bits."""
+    scene = torch.full((2, *shape), 200.0)
+    scene[:, shape[0] // 2 :, : shape[1] // 4] = 40.0
+    seen = against_background(scene, fit)
+    assert seen.shape == scene.shape and (seen[:, 0, -1] == 0).all() and (seen[:, -1, 0] < 0).all()
+    torch.testing.assert_close(against_background(0.6 * scene, fit), seen, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("shape", SIZES, ids=str)
+def test_pictures_of_any_size_are_augmented(shape):
+    frames = torch.randint(0, 256, (4, 2, *shape), dtype=torch.uint8)
+    worse = Augmentation(AugmentSettings(strength=1.0, share=1.0))(frames, [1, 2])
+    assert worse.shape == frames.shape and worse.dtype == torch.uint8
+    assert (worse != frames).flatten(1).any(1).all()
 
 
 @pytest.mark.parametrize("shape", SIZES, ids=str)

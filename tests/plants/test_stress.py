@@ -1,8 +1,11 @@
 """Named conditions do what they say, in any order, and are refused where they make no sense."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from hjepa_cli.config.schema import CameraSettings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
@@ -221,3 +224,32 @@ def test_every_condition_can_be_simulated(name: str) -> None:
         simulator = Simulator(under(settings, text), None)
         block = Block("oracle", (Point("gap", 2.0),), 0, 2)
         assert np.isfinite(block.compute(simulator, lambda steps: None).cost).all()
+
+
+@pytest.mark.parametrize("shape", [(17, 40, 1), (32, 24, 3), (120, 160, 1)], ids=str)
+def test_pictures_of_any_size_get_worse_and_grey_ones_have_no_colours(shape) -> None:
+    pictures = np.random.default_rng(0).uniform(0, 255, (3, 2, *shape)).astype(np.float32)
+    grey = shape[2] == 1
+    for one in CONDITIONS.values():
+        if one.apply is None or (grey and one.of_colours):
+            continue
+        for severity in one.ladder:
+            worse = applied(one.name, severity, pictures)
+            assert worse.shape == pictures.shape and np.isfinite(worse).all(), one.name
+    size = CameraSettings(*shape[:2], grey=grey)
+    settings = dataclasses.replace(under(load_settings(), "colour=0.1"), camera=size)
+    if grey:
+        with pytest.raises(UsageError, match="grey"):
+            actual_camera(settings)
+    else:
+        assert frames_of(actual_camera(settings), STATES).shape == (6, 2, *shape)
+
+
+def test_recordings_are_retaken_as_a_camera_would_have_seen_them() -> None:
+    settings = under(load_settings(), "light=0.5+corner=8")
+    recorded = dataclasses.replace(settings, plant="recorded")
+    clean = frames_of(actual_camera(load_settings()), STATES)
+    expected = frames_of(actual_camera(settings), STATES)
+    np.testing.assert_array_equal(actual_camera(recorded).retake(clean), expected)
+    with pytest.raises(UsageError, match="actuation is of forces"):
+        actual_camera(under(recorded, "actuation=3"))

@@ -49,6 +49,20 @@ def test_the_page_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
         assert "state" not in columns
         assert columns["pixels"].shape == (len(columns["action"]), 32, 64, 3)
 
+    stressed = (
+        *("eval", "--preset", "smoke"),
+        *("--dataset", "data/robot", "--checkpoint", "runs/robot"),
+    )
+    outcome = shell(*stressed, "--stress", "light=0.2+noise=40,audit", "--json")
+    (first, *others), nominal = outcome.document["conditions"], outcome.document["methods"]
+    assert first["condition"] == "light=0.2+noise=40" and len(others) == 22, "pictures alone"
+    assert first["methods"].keys() == nominal.keys()
+    assert first["methods"]["hold"]["nmae"] != nominal["hold"]["nmae"]
+    assert shell("report", "runs/eval/0002", "--quiet").code == 0
+    for row, why in (("mass", "recordings have none"), ("lihgt", "did you mean 'light'")):
+        assert_one_line_error(shell(*stressed, "--stress", row), 2, why)
+    assert_one_line_error(shell(*stressed, "--false-alarm", "0.1"), 2, "simulated pictures")
+
     refused = shell("export", "runs/robot", "--to", "bundle", "--quiet")
     assert_one_line_error(refused, 2, "learned from recordings")
     assert not (tmp_path / "bundle").exists()

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from hjepa_cli.config.schema import AugmentSettings
 from hjepa_cli.config.settings import load_settings
@@ -15,10 +14,6 @@ from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import TrajectoryBatch
 from hjepa_cli.core.training.jepa import Jepa
-from hjepa_cli.core.training.levels import EmbeddedTrajectories, flat_loss
-from hjepa_cli.core.training.rendered import RenderedSplit
-from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages.embedding_training import embed_all
 
 OFF = {
     field.name: 0.0
@@ -52,7 +47,7 @@ def test_off_it_does_nothing_and_draws_nothing() -> None:
     assert augment(frames, augment.draw(3, stream)) is frames
     assert stream.bit_generator.state == before
     assert "augment" not in load_settings().as_dict()
-    assert load_settings(flags={"augment.strength": 1.0}).as_dict()["augment"]["copies"] == 2
+    assert load_settings(flags={"augment.strength": 1.0}).as_dict()["augment"]["strength"] == 1.0
 
 
 def test_a_window_follows_from_its_seed_alone() -> None:
@@ -161,45 +156,3 @@ def test_the_context_encoder_sees_worse_pictures_than_its_target() -> None:
     jepa.losses(batch)
     target: Any = jepa.target.module
     assert torch.equal(encoder.frames, batch.worse) and torch.equal(target.frames, batch.frames)
-
-
-class Means(nn.Module):
-    """It embeds a picture as its mean, twice."""
-
-    def forward(self, frames: torch.Tensor) -> torch.Tensor:
-        return frames.float().mean((1, 2, 3))[:, :2]
-
-
-def test_augmented_copies_have_clean_labels_and_clean_embeddings_to_reach() -> None:
-    frames = torch.randint(0, 255, (5, 9, 64, 128, 3), dtype=torch.uint8)
-    states, forces = torch.rand(5, 8, 4), torch.rand(5, 8)
-    split = RenderedSplit(frames, states, forces, 0.5 * forces)
-    changes = {"augment.strength": 1.0, "augment.copies": 3, "hierarchy.shifted_copies": 1}
-    settings = load_settings(flags=changes)
-    views = embed_all(Means(), split, settings, Screen(quiet=True), flip=False)
-    assert len(views) == 2 + 3
-    clean, copies = views[:2], views[2:]
-    for number, (copy, labels) in enumerate(copies):
-        source, source_labels = clean[number * 2 // 3]
-        assert torch.equal(labels, source_labels) and torch.equal(copy.actions, source.actions)
-        assert copy.clean is not None and torch.equal(copy.clean, source.z)
-        assert not torch.equal(copy.z, source.z)
-    assert not torch.equal(copies[0][0].z, copies[1][0].z)
-    plain = load_settings(flags={"hierarchy.shifted_copies": 1})
-    before = embed_all(Means(), split, plain, Screen(quiet=True), flip=False)
-    for (view, labels), (same, same_labels) in zip(clean, before, strict=True):
-        assert torch.equal(view.z, same.z) and torch.equal(labels, same_labels)
-
-
-def test_predictors_start_at_worse_embeddings_and_are_to_reach_clean_ones() -> None:
-    z = torch.nn.functional.normalize(torch.randn(3, 6, 4), dim=-1) * 2
-    other = torch.nn.functional.normalize(torch.randn(3, 6, 4), dim=-1) * 2
-    data = EmbeddedTrajectories(other, torch.zeros(3, 6), z)
-
-    def stays(state: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        return state
-
-    stream = np.random.default_rng(0)
-    loss = flat_loss(stays, data, 1, horizon_steps=1, trajectories=3, starts=5, generator=stream)
-    cosines = torch.nn.functional.cosine_similarity(other[:, :-1], z[:, 1:], dim=-1)
-    assert float(loss) == pytest.approx(float(1 - cosines.mean()), abs=1e-5)

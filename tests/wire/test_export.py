@@ -178,7 +178,43 @@ def test_models_of_other_pictures_are_refused(tmp_path):
             export.exported_method(model, None)
 
 
-def test_lockstep_is_the_simulator(exported):
+@pytest.fixture(scope="module")
+def apart(checkpoint, tmp_path_factory):
+    """The zoo's networks with pictures fitted to their background, three steps apart; exported."""
+    from hjepa_cli.core.networks.model import load_modules, tensors_of
+    from hjepa_cli.storage import files
+    from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
+    from hjepa_cli.wire.export import export
+
+    shipped, directory = load_checkpoint(checkpoint), tmp_path_factory.mktemp("apart")
+    metadata, modules = files.jsonable(shipped.metadata), load_modules(shipped)
+    for told in (metadata["architecture"], metadata["settings"]["encoder"]):
+        told |= {"photometric": "affine", "frame_gap": 3}
+    modules["encoder"].input_mean[:3] -= 255  # the background is white
+    modules["encoder"].input_std[3:] *= 3  # things move three times as far
+    save_checkpoint(directory / "model.safetensors", tensors_of(modules), metadata)
+    return export(directory / "model.safetensors", directory / "out", None)
+
+
+def test_pictures_apart_and_fitted_to_their_background_are_exported(apart, monkeypatch):
+    from hjepa_cli.wire import export
+
+    # Networks that were not trained for it lose a little more in 8 bits.
+    monkeypatch.setitem(export.LARGEST_INT8, "rms_force_n", 0.06)
+    assert apart.look == (2, 3) and open_bundle(apart.directory).look == (2, 3)
+    measured = export.check(apart, apart.directory.parent / "model.safetensors")
+    assert max(measured["max_error"].values()) <= 1e-5
+    manifest = json.loads((apart.directory / MANIFEST).read_text())
+    for gap in (0, 16, 1.0, "3"):  # a device remembers 16 pictures
+        changed = apart.directory.parent / f"changed-{gap}"
+        changed.mkdir()
+        (changed / MANIFEST).write_text(json.dumps(manifest | {"frame_gap": gap}))
+        with pytest.raises(DataError, match="malformed"):
+            open_bundle(changed)
+
+
+@pytest.mark.parametrize("which", ["exported", "apart"])
+def test_lockstep_is_the_simulator(which, request):
     """Two loops with the same networks: over the wire and in the simulator, lost downlinks too.
 
     Forces travel as float32, which the simulator's planner makes them too: states are equal but
@@ -195,7 +231,9 @@ def test_lockstep_is_the_simulator(exported):
     from hjepa_cli.wire.controller import Controller
     from hjepa_cli.wire.runtime import Runtime
 
-    bundle, kind, devices, steps = open_bundle(exported), plant("desktop"), 4, 120
+    made = request.getfixturevalue(which)
+    bundle = made if which == "apart" else open_bundle(made)
+    kind, devices, steps = plant("desktop"), 4, 120
     runtime = Runtime(bundle)
     protocol = dataclasses.replace(ProtocolSettings(), warmup_steps=0, steps=steps)
     draws, sent = Draws.make(protocol, devices, 3), gap_schedule(30, steps, devices)

@@ -37,6 +37,15 @@ def test_the_encoder_sees_the_newest_pictures_and_copies_of_the_first():
     assert seen == [[1, 1], [1, 2], [2, 3]]
 
 
+def test_pictures_further_apart_are_picked_from_those_that_are_remembered():
+    """Four pictures, three apart: of numbers 1, 2, … those that many back, or the first."""
+    watched = Watched(Pictures(*map(picture, range(1, 21))), 4, 3)
+    seen = []
+    while watched.read():
+        seen.append(watched.frames[0, :, 0, 0, 0].tolist())
+    assert seen == [[max(now - back, 1) for back in (9, 6, 3, 0)] for now in range(1, 21)]
+
+
 @pytest.mark.parametrize(
     "bad",
     [

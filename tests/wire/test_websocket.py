@@ -91,7 +91,7 @@ class Runtime:
 
 
 class Bundle:
-    frames, stride, axes, step_s = 2, 3, 1, 0.001
+    look, stride, axes, step_s = (2, 1), 3, 1, 0.001
     plant, digest = "desktop", bytes(32)
     manifest: ClassVar = {"method": "hjepa"}
 
@@ -106,6 +106,17 @@ def test_a_connection_remembers_the_last_pictures():
     client.act({"image": np.stack(pictures[1:])})
     client.act({"pixels": pictures[0], "reset": True})
     assert runtime.frames == [[1, 1], [2, 3], [1, 1]]
+
+
+def test_a_connection_remembers_pictures_that_are_further_apart():
+    class Apart(Bundle):
+        look = (3, 2)
+
+    runtime = Runtime()
+    client = Client(Apart, runtime)
+    for value in range(1, 8):
+        client.act({"image": np.full(FRAME_SHAPE, value, np.uint8)})
+    assert runtime.frames == [[max(now - back, 1) for back in (4, 2, 0)] for now in range(1, 8)]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ It needs nothing of a device: the controller looks at what it has received.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import torch
@@ -118,11 +117,3 @@ class PacketCheck:
         passed[rows[kept]] = True
         ages = None if ages is None else ages[kept]
         return passed, packets[torch.from_numpy(kept)] if kept.any() else None, ages
-
-
-def share_flagged(controller: Any) -> np.ndarray[Any, Any] | None:
-    """Return the share of flagged packets of each device [n]; ``None`` where nobody looked."""
-    check = getattr(controller, "check", None)
-    if not isinstance(check, PacketCheck):
-        return None
-    return np.asarray(check.flagged / np.maximum(check.received, 1))

@@ -28,7 +28,6 @@ from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels
-from hjepa_cli.core.control.familiarity import share_flagged
 from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
@@ -393,6 +392,18 @@ def simulate(
     score, cost, lost = (values.reshape(points, devices) for values in means)
     flagged = share_flagged(controller)
     return Outcome(score, cost, lost, None if flagged is None else flagged.reshape(score.shape))
+
+
+def share_flagged(controller: Any) -> Floats | None:
+    """Return the share of flagged packets of each device [n]; ``None`` where nobody looked.
+
+    A controller that looks has a :class:`~hjepa_cli.core.control.familiarity.PacketCheck`.
+    """
+    check = getattr(controller, "check", None)
+    flagged, received = (getattr(check, name, None) for name in ("flagged", "received"))
+    if not (isinstance(flagged, np.ndarray) and isinstance(received, np.ndarray)):
+        return None
+    return np.asarray(flagged / np.maximum(received, 1))
 
 
 class ScoredPlants:

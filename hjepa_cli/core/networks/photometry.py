@@ -32,17 +32,17 @@ def against_background(frames: Tensor, fit: str) -> Tensor:
             contrast decides: noise, gradients and grey objects count little beside the scene's own
             darkest parts.
     """
-    level, pixels, width = _background(frames), frames.float().flatten(2), frames.shape[2]
+    level, width = _background(frames), frames.shape[2]
+    # A row of pixels is one run in memory: what is the same for all of them costs least along it.
+    apart = frames.float().flatten(2) - level.repeat(1, width)[:, None]
     if fit == "gain":
         factor = WHITE / level.clamp_min(LEAST)
     else:
-        half = pixels[:, ::2] - level.repeat(1, width)[:, None]
-        fourth = half.square_().square_().sum(1).view(len(frames), width, -1).sum(1)
-        spread = (fourth / (half.shape[1] * width)) ** 0.25
+        half = apart[:, ::2].square().square_()
+        fourth = half.sum(1).view(frames.shape[0], width, -1).sum(1)
+        spread = (fourth / (half.shape[1] * width)).sqrt().sqrt()
         factor = CONTRAST / spread.clamp_min(LEAST)
-    # A row of pixels is one run in memory: factors along it cost least.
-    factors, offsets = (along.repeat(1, width)[:, None] for along in (factor, -level * factor))
-    return torch.addcmul(offsets, pixels, factors).view(frames.shape)
+    return apart.mul_(factor.repeat(1, width)[:, None]).view(frames.shape)
 
 
 def _background(frames: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.errors import require
@@ -69,6 +68,8 @@ def shot(pictures: Pictures, width: float, random: Generator) -> Pictures:
 
 def bayer(pictures: Pictures, width: float, random: Generator) -> Pictures:
     """See one colour per pixel (RGGB), with noise in each, and fill in the others by neighbours."""
+    from scipy import ndimage
+
     raw = noise(pictures, width, random)
     seen = np.zeros(pictures.shape[2:], np.float32)
     seen[0::2, 0::2, 0] = seen[0::2, 1::2, 1] = seen[1::2, 0::2, 1] = seen[1::2, 1::2, 2] = 1
@@ -80,6 +81,8 @@ def bayer(pictures: Pictures, width: float, random: Generator) -> Pictures:
 
 def blur(pictures: Pictures, width_px: float, random: Generator) -> Pictures:
     """Blur by a Gaussian of a standard deviation in pixels."""
+    from scipy import ndimage
+
     width = (0, 0, width_px, width_px, 0)
     return cast(Pictures, ndimage.gaussian_filter(pictures, width, mode="nearest"))
 
@@ -137,6 +140,8 @@ def vignette(pictures: Pictures, share: float, random: Generator) -> Pictures:
 
 def texture(pictures: Pictures, depth: float, random: Generator) -> Pictures:
     """Paint one and the same pattern of stains over all, up to so many grey levels darker."""
+    from scipy import ndimage
+
     drawn = generator(_TEXTURE_KEY).standard_normal(pictures.shape[2:4])
     stains = ndimage.gaussian_filter(drawn, 3, mode="wrap")
     stains = (stains - stains.min()) / np.ptp(stains)

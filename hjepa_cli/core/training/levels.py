@@ -15,25 +15,14 @@ from hjepa_cli.core.training.losses import cosine_loss, rollout_loss
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddedTrajectories:
-    """Frozen embeddings [N, T, D] go with the applied actions ÷ force limit [N, T, *A].
-
-    ``clean`` are those [N, T, D] of clean pictures, which predictions shall reach, where ``z`` is
-    of worse ones.
-    """
+    """Frozen embeddings [N, T, D] go with the applied actions ÷ force limit [N, T, *A]."""
 
     z: Tensor
     actions: Tensor
-    clean: Tensor | None = None
-
-    @property
-    def targets(self) -> Tensor:
-        """Return what predictions shall reach [N, T, D]."""
-        return self.z if self.clean is None else self.clean
 
     def first(self, count: int) -> "EmbeddedTrajectories":
         """Return the first ``count`` trajectories."""
-        clean = None if self.clean is None else self.clean[:count]
-        return EmbeddedTrajectories(self.z[:count], self.actions[:count], clean)
+        return EmbeddedTrajectories(self.z[:count], self.actions[:count])
 
     def choose(self, count: int, generator: np.random.Generator) -> Tensor:
         """Draw the trajectories [B] of a batch: what a loss below draws first."""
@@ -80,8 +69,7 @@ def flat_loss(
     begin = np.sort(generator.choice(frames - 1, size=min(starts, frames - 1), replace=False))
     z = data.z[rows, k]
     horizon = max(horizon_steps // stride, 1)
-    targets = z if data.clean is None else data.clean[rows, k]
-    return rollout_loss(predictor, z, targets, actions, torch.from_numpy(begin), horizon)
+    return rollout_loss(predictor, z, z, actions, torch.from_numpy(begin), horizon)
 
 
 def medium_loss(
@@ -171,7 +159,7 @@ def interior(
     """Return true embeddings inside gaps, at a + stride, …, a + gap − stride: [G, C − 1, D]."""
     rows, a = begin
     inside = a[:, None] + torch.arange(stride, gap, stride)
-    return data.targets[rows[:, None], inside]
+    return data.z[rows[:, None], inside]
 
 
 def split(actions: Tensor, stride: int) -> Tensor:
