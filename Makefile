@@ -1,6 +1,7 @@
 # make demo   how many cart-poles a radio cell supports: installs, prints the table, draws the figure
 # make test   installs and runs the tests; make test ARGS='-k camera' runs some
 # make lint   ruff on everything, mypy --strict on hjepa_cli/core, who may import whom
+# make site   the documentation as a site, in site/; links and anchors are checked
 # make clean  removes .venv and what tools leave behind
 #
 # PYTHON=python3.12 chooses the interpreter (3.11 or newer).
@@ -8,7 +9,7 @@
 export PYTHON ?= python3
 ARGS ?=
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint site clean
 
 demo:
 	@scripts/venv plot
@@ -24,5 +25,9 @@ lint:
 	.venv/bin/mypy
 	.venv/bin/lint-imports --no-cache --no-logo
 
+site:
+	@scripts/venv docs
+	.venv/bin/zensical build --strict
+
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache dist
+	rm -rf site .cache .venv .mypy_cache .ruff_cache .pytest_cache dist

@@ -1,7 +1,7 @@
 """hjepa does semantic predictive control over wireless links with a hierarchical JEPA.
 
 The names in ``__all__`` are the public Python interface; each is imported when it is first used, so
-that ``import hjepa_cli`` costs nothing. Examples: docs/python.md.
+that ``import hjepa_cli`` costs nothing. Examples: docs/reference/python.md.
 """
 
 import importlib

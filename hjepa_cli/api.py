@@ -61,7 +61,7 @@ def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tu
 
     Args:
         model: of :func:`load_model`.
-        z: the last received embeddings [n, D], a tensor or an array.
+        z: the last received embeddings [n, d], a tensor or an array.
         steps: control steps, at least 1; they are played in whole strides.
         method: a predictor that the model holds.
 

@@ -103,7 +103,7 @@ class NumericalError(HjepaError):
 
 
 class OutOfMemory(HjepaError):
-    """What was asked for does not fit into memory."""
+    """The work that was asked for does not fit into memory."""
 
     exit_code = 70
 

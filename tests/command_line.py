@@ -92,7 +92,8 @@ def open_shell(
 
 def block(page: str, word: str) -> str:
     """The first block of Python of a page of the documentation that has a word in it."""
-    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    (path,) = (ROOT / "docs").rglob(page)
+    text = path.read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     return next(code for code in blocks if word in code)
 

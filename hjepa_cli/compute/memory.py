@@ -1,4 +1,4 @@
-"""What cannot fit into memory is refused before the work, not killed in the middle of it."""
+"""Work that cannot fit into memory is refused at its start, not killed in its middle."""
 
 import contextlib
 import os

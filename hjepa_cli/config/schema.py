@@ -3,7 +3,7 @@
 The command line builds its flags and their help from these declarations, and
 :mod:`hjepa_cli.config.settings` checks files and flags against them. Units are in the names. Where
 the paper gives a value the default is that value, but for the protocol's, which are those of
-``--protocol paper``; the rest is ours (docs/paper_map.md).
+``--protocol paper``; the rest is ours (docs/explanation/paper_map.md).
 """
 
 import dataclasses

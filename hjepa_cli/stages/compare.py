@@ -281,7 +281,7 @@ def collected(
         of = f"these are all of seed {seeds[0]}" if seeds else "these have no model at all"
         raise MissingInputError(
             f"a comparison over trainings needs two of them; {of}",
-            hint="train and evaluate with another --seed (docs/experiments.md), or hjepa report",
+            hint="train and evaluate with another --seed (docs/how-to/studies.md), or hjepa report",
         )
     others = sorted(by_method.keys() - set(METHODS))
     order = methods or [*(name for name in METHODS if name in by_method), *others]

@@ -1,4 +1,4 @@
-"""What a finished run says is checked before anything of it is shown: it may be anybody's.
+"""The result of a finished run is checked before it is shown: it may be anybody's.
 
 A seal tells that a result was not changed; only its values tell that it is one of its stage.
 """
@@ -123,7 +123,7 @@ class _StressEntry(msgspec.Struct):
 
 
 class _Stress(msgspec.Struct):
-    """What ``eval --stress`` says of a simulated plant."""
+    """The result of ``eval --stress``, of a simulated plant."""
 
     gaps: Annotated[list[Whole], Meta(min_length=1)]
     conditions: list[str]
@@ -167,7 +167,7 @@ class _Latent(msgspec.Struct):
 
 
 class _Offline(msgspec.Struct):
-    """What ``eval`` says of a recorded plant."""
+    """The result of ``eval`` of a recorded plant."""
 
     plant: str
     seed: Whole

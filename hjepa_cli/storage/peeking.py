@@ -1,4 +1,4 @@
-"""What a file says of itself is read without the rest of it, and without relying on it."""
+"""Metadata of a file are read without the rest of it, and without relying on them."""
 
 import contextlib
 from collections.abc import Iterable

@@ -24,7 +24,7 @@ QUIET_S = 0.5  # without a datagram the session is taken to be gone
 
 
 class Played(NamedTuple):
-    """What a device plays in a step: forces [m], and where they are from."""
+    """Forces [m] that a device plays in a step, and where they are from."""
 
     forces_n: Singles
     source: int

@@ -1,4 +1,4 @@
-"""What a server counts, for Prometheus: one text page, made when it is asked for."""
+"""Counts of a server for Prometheus: one text page, made when it is asked for."""
 
 import contextlib
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Datagrams have fixed layouts, byte by byte; docs/protocol.md is their reference.
+"""Datagrams have fixed layouts, byte by byte; docs/reference/protocol.md is their reference.
 
 All numbers are little-endian. Every datagram begins with ``HJ``, the version and its type, and ends
 with a tag (:mod:`hjepa_cli.wire.auth`). Nothing here trusts a byte: a datagram whose length is not

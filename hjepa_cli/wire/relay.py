@@ -34,7 +34,7 @@ LOST = "lost"
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """What a real link did to one datagram after the other; it begins again at its end.
+    """Delays and losses of a real link, datagram by datagram; it begins again at its end.
 
     Attributes:
         delays_ms: of each; NaN: it was lost.
@@ -88,7 +88,7 @@ class Trace:
 
 @dataclasses.dataclass(frozen=True)
 class Impairment:
-    """What one direction of a link does.
+    """Losses and delays of one direction of a link.
 
     Attributes:
         loss: share of datagrams that are lost.

@@ -40,7 +40,7 @@ def rewrite(path: Path, tensors: dict[str, np.ndarray], metadata: dict[str, Any]
 
 
 def independent_digest(sealed: dict[str, Any], tensors: dict[str, np.ndarray]) -> str:
-    """The digest, written again from its definition in docs/architecture.md."""
+    """The digest, written again from its definition in docs/explanation/architecture.md."""
     compact = {"separators": (",", ":"), "ensure_ascii": False}
     data = json.dumps(sealed, sort_keys=True, **compact).encode()  # type: ignore[arg-type]
     for name, array in sorted(tensors.items()):

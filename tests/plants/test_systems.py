@@ -334,7 +334,7 @@ def test_two_forces_through_all_five_stages(tmp_path, monkeypatch, capsys):
 
 def test_the_page_about_your_own_plant_is_complete(tmp_path):
     """Its two blocks are all that a system takes: put in place, every stage runs on it."""
-    page = (ROOT / "docs/own_plant.md").read_text()
+    page = (ROOT / "docs/tutorials/own_plant.md").read_text()
     module, preset = (
         next(
             block for block in re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL) if word in block

@@ -47,7 +47,7 @@ def test_importing_the_package_imports_nothing_else():
 
 
 def test_every_public_name_is_there_documented_and_in_the_docs():
-    text = (ROOT / "docs/python.md").read_text()
+    text = (ROOT / "docs/reference/python.md").read_text()
     assert sorted(hjepa_cli.__all__) == sorted(hjepa_cli._HOMES)
     for name in hjepa_cli.__all__:
         assert getattr(hjepa_cli, name).__doc__, name
@@ -61,7 +61,9 @@ def test_the_examples_of_the_documentation():
 
     if "desktop-h4m2l1" not in list_models():
         pytest.skip("the examples use a model that the zoo does not have")
-    failed, attempted = doctest.testfile(str(ROOT / "docs/python.md"), module_relative=False)
+    failed, attempted = doctest.testfile(
+        str(ROOT / "docs/reference/python.md"), module_relative=False
+    )
     assert failed == 0 and attempted > 20
 
 

@@ -15,7 +15,11 @@ from command_line import ROOT, open_shell
 
 from hjepa_cli.storage.zoo import list_models
 
-PAGES = ("README.md", "CONTRIBUTING.md", *sorted(f"docs/{p.name}" for p in ROOT.glob("docs/*.md")))
+PAGES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    *sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md")),
+)
 NOT_RUN = re.compile(r"<!-- not run: [^>]+ -->\s*```\w*\n.*?```", re.DOTALL)
 WITH_PLAN = (
     *("tune-law", "collect", "train-encoder", "train-hierarchy", "train-fusion"),
@@ -27,11 +31,11 @@ PLACEHOLDER = re.compile(r"[A-Z]{3,}|…|\.\.\.|[<>\[\]|]|\{")
 
 
 def test_the_reference_of_the_command_line_is_current():
-    """Otherwise: scripts/cli_reference > docs/cli.md"""
+    """Otherwise: scripts/cli_reference > docs/reference/cli.md"""
     loader = importlib.machinery.SourceFileLoader("reference", str(ROOT / "scripts/cli_reference"))
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader("reference", loader))
     loader.exec_module(module)
-    assert (ROOT / "docs/cli.md").read_text() == module.reference()
+    assert (ROOT / "docs/reference/cli.md").read_text() == module.reference()
 
 
 SHELL = re.compile(
@@ -49,7 +53,7 @@ def commands():
     """All commands of the documentation, from indented and fenced blocks and from running text."""
     found = {}
     for page in PAGES:
-        if page in ("docs/cli.md", "docs/LOG.md"):  # headings; commands of their day
+        if page in ("docs/reference/cli.md", "docs/LOG.md"):  # headings; commands of their day
             continue
         text = text_of(page)
         lines = re.findall(r"^ {4}(?:\.venv/bin/)?(hjepa [^\n#]*)", text, re.MULTILINE)
@@ -84,7 +88,7 @@ def test_every_command_of_the_documentation_is_understood(
 def other_lines():
     """What command blocks and running text hold beside `hjepa …`, by page."""
     for page in PAGES:
-        if page not in ("docs/cli.md", "docs/LOG.md"):
+        if page not in ("docs/reference/cli.md", "docs/LOG.md"):
             text = text_of(page)
             lines = SHELL.findall(text) + re.findall(r"`((?:make|python|torchrun) [^`\n]+)`", text)
             for line in dict.fromkeys(line.strip() for line in lines):
@@ -139,7 +143,7 @@ def blocks():
 
 @pytest.mark.parametrize(("page", "code"), list(blocks()), ids=lambda v: v if v in PAGES else "")
 def test_every_python_block_runs(tmp_path, monkeypatch, page, code):
-    if page == "docs/python.md":
+    if page == "docs/reference/python.md":
         pytest.skip("test_api.py runs it")
     if "hjepa_cli.gym" in code:
         pytest.importorskip("gymnasium")

@@ -189,10 +189,10 @@ def test_a_perfect_channel_changes_nothing_and_a_dead_one_shows_the_start_foreve
 
 
 def test_the_documented_run_of_stable_baselines3(monkeypatch, tmp_path, capsys):
-    """The block of docs/agents.md as it stands, with fewer steps."""
+    """The block of docs/how-to/agents.md as it stands, with fewer steps."""
     pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
-    text = (ROOT / "docs/agents.md").read_text()
+    text = (ROOT / "docs/how-to/agents.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     (code,) = [block for block in blocks if "stable_baselines3" in block]
     short = re.sub(r"total_timesteps=[\d_]+", "total_timesteps=128", code)
@@ -201,5 +201,5 @@ def test_the_documented_run_of_stable_baselines3(monkeypatch, tmp_path, capsys):
     assert short != code
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other people's deprecations
-        exec(compile(short, "docs/agents.md", "exec"), {"__name__": "agents"})
+        exec(compile(short, "docs/how-to/agents.md", "exec"), {"__name__": "agents"})
     assert "return" in capsys.readouterr().out

@@ -9,7 +9,7 @@ from command_line import ROOT, assert_one_line_error, open_shell
 
 from hjepa_cli.storage import seals
 
-PAGE = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/tutorials/own_data.md").read_text(encoding="utf-8")
 TRAINED = ("train-encoder", "train-hierarchy", "eval")  # small here, to see that they run
 
 

@@ -122,7 +122,8 @@ class StrideController(_Strides):
             raise UsageError(
                 f"packets come late, and {type(self._planner).__name__} cannot move an embedding "
                 "on under given forces: it has no follow(z, forces_n, ages)",
-                hint="write one (docs/plugins.md), or leave out --delay-steps and --jitter-steps",
+                hint="write one (docs/how-to/plugins.md), "
+                "or leave out --delay-steps and --jitter-steps",
             )
         forces_n = self._sent.since(np.flatnonzero(delivered), ages)
         return self._planner.follow(packets, torch.from_numpy(forces_n).float(), ages)

@@ -1,4 +1,4 @@
-"""What recordings alone say of a model: how its forces err after a packet, and its embeddings.
+"""Measure a model on recordings alone: errors of its forces after a packet, its embeddings.
 
 No simulator is asked: a controller is left alone after one packet, as in
 :mod:`hjepa_cli.core.evaluation.control_errors`, and its forces are compared with those that the

@@ -1,6 +1,6 @@
 """These numbers tell the stage gates whether embeddings are alive and know the state.
 
-Nothing here trains the encoder; docs/metrics.md lists the healthy ranges.
+Nothing here trains the encoder; docs/reference/metrics.md lists the healthy ranges.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What models are given from outside is checked: other types or layouts are read as garbage."""
+"""Arrays from outside are checked: networks would read other types or layouts as garbage."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What goes wrong with pictures between a scene and an encoder, each as a function of a severity.
+"""Flaws of pictures between a scene and an encoder, each a function of a severity.
 
 A function takes pictures float32 [m, κ, H, W, C] in grey levels, 0 to 255, the κ of one packet in
 a row, a severity and a generator, and returns pictures of the same shape. What is fast (flicker,

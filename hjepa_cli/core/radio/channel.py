@@ -3,7 +3,7 @@
 Large scale: 3GPP TR 38.901, indoor factory (InF), clauses 7.4.1 and 7.4.2. Small scale, rate and
 outage: the paper's system model, eqs. 2 to 4. Distances in metres, carrier in GHz, powers in dBm,
 ratios in dB; every function broadcasts over numpy arrays and returns a float64 scalar for scalar
-input. ``docs/radio.md`` lists the assumptions.
+input. ``docs/reference/radio.md`` lists the assumptions.
 """
 
 import functools

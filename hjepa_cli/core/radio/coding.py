@@ -1,7 +1,8 @@
 """A packet takes more on the air by short-packet coding and retransmissions.
 
 Capacity is the default everywhere. Under power control the SNR is known and a code of finite
-length needs a few per cent more; under fading the outage already says it all (docs/radio.md).
+length needs a few per cent more; under fading the outage already says it all
+(docs/reference/radio.md).
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What becomes of a recording is decided before a picture is read."""
+"""Decide what becomes of a recording before a picture of it is read."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
