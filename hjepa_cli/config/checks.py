@@ -89,6 +89,11 @@ def check_settings(settings: Settings) -> None:
     check_payload(settings.protocol.payload)
     _check_link(settings.protocol)
     _check_names(SCHEDULERS, settings.radio.schedulers, "radio.schedulers")
+    if settings.plant == RECORDED and settings.sensor.works:
+        raise UsageError(
+            "[sensor] is of simulated cameras; the pictures of a recorded plant have been taken",
+            key="sensor",
+        )
     if settings.conditions.pole_length != 1:
         PLANTS[settings.plant].with_pole_length(settings.conditions.pole_length)
 

@@ -76,6 +76,30 @@ class CameraSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class SensorSettings:
+    """What a simulated camera's lens and sensor do to its ideal pictures; nothing unless set.
+
+    A dataset brings its own along, and so does a model; ``eval``, ``view`` and devices of the wire
+    take any that is set here instead. Grey levels are of 255, pixels those of [camera].
+    """
+
+    white: Annotated[float, Meta(gt=0, le=255)] = 255.0  # grey level of a white background
+    texture: GreyLevels = 0.0  # depth of stains on the background
+    distortion: Annotated[float, Meta(ge=-0.3, le=0.5)] = 0.0  # of a lens, share at the corners
+    vignette: Annotated[float, Meta(ge=0, le=1)] = 0.0  # fall of light to the corners, share
+    exposure_ms: NotNegative = 0.0  # at most a control step
+    bayer: bool = False  # one colour per pixel, the others are filled in
+    shot_noise: Annotated[float, Meta(ge=0, le=128)] = 0.0  # standard deviation at 255
+    read_noise: Annotated[float, Meta(ge=0, le=128)] = 0.0  # standard deviation
+    ideal: bool = False  # none of these, whatever a model brings along
+
+    @property
+    def works(self) -> bool:
+        """Return whether pictures are others than the ideal ones."""
+        return not self.ideal and self != SensorSettings()
+
+
+@dataclasses.dataclass(frozen=True)
 class RecordedSettings:
     """A plant that only recordings are known of is what their dataset says of it.
 
@@ -700,6 +724,7 @@ class Settings:
     tune: TuneSettings = TuneSettings()
     fusion: FusionSettings = FusionSettings()
     camera: CameraSettings = CameraSettings()
+    sensor: SensorSettings = SensorSettings()
     recorded: RecordedSettings = RecordedSettings()
     collect: CollectSettings = CollectSettings()
     encoder: EncoderSettings = EncoderSettings()
@@ -724,6 +749,7 @@ class Settings:
         usual = {
             "augment": not self.augment.strength,
             "camera": self.camera == CameraSettings(),
+            "sensor": self.sensor == SensorSettings(),
         }
         left_out = [name for name, is_so in usual.items() if is_so and not complete]
         for key, value in UNSAID.items():

@@ -33,7 +33,7 @@ from hjepa_cli.core.control.loop import Draws, LinkDraws, delivery_schedule, gap
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
 from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_back, frames_of
-from hjepa_cli.core.plants.named import plant_of
+from hjepa_cli.core.plants.named import plant_of, seen_as_trained
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.core.statistics import bootstrap_weights, mean_interval
 from hjepa_cli.errors import NumericalError, Unavailable
@@ -154,7 +154,7 @@ def run(
         runtime = Runtime(bundle, backend)
         runtime.warm_up("encoder", "actor")
         moved = actual_plant(settings.plant, settings.conditions)
-        camera = actual_camera(settings)
+        camera = actual_camera(seen_as_trained(settings, bundle.manifest["camera"]))
         fleet = Fleet(
             *(bundle, runtime, moved, camera, draws, sent, NO_KEY, period_s),
             local=harm is not None,

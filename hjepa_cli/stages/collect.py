@@ -56,7 +56,7 @@ from hjepa_cli.storage.shards import (
     remove_log,
 )
 
-OWN = ("control", "camera")  # what a dataset brings along for all that is done with it
+OWN = ("control", "camera", "sensor")  # what a dataset brings along for all that is done with it
 FRAMES_PER_SAMPLE = 2  # κ: current and previous
 TOGETHER = 20  # trajectories rendered at a time; the sample is one such batch
 WORTH_WORKERS = 4_000_000  # simulated steps; below, processes cost more than they bring
@@ -76,7 +76,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     """
     check(settings)
     started = time.perf_counter()
-    camera = camera_of(plant_of(settings), settings.camera)
+    camera = camera_of(plant_of(settings), settings.camera, settings.sensor)
     definition: dict[str, Any] = {
         "seed": settings.seed,
         "collect": settings.as_dict()["collect"] | {"plant": settings.plant},
@@ -230,6 +230,13 @@ def check(settings: Settings) -> None:
             "a recorded plant is not simulated; its datasets are imported",
             hint="hjepa data import SOURCE",
         )
+    if settings.sensor.ideal:
+        raise UsageError(
+            "sensor.ideal = true is for models that bring a sensor along; a collection is ideal "
+            "unless [sensor] says otherwise",
+            key="sensor.ideal",
+        )
+    camera_of(plant(settings.plant), settings.camera, settings.sensor)
     total = sum(count for count, _ in split_sizes(settings.collect).values())
     most = MAX_SHARDS * per_shard(settings.collect.frames == "stored")
     if total > most:
@@ -281,7 +288,7 @@ def make_shard(
     """Do a unit of parallel work: decided by its arguments, written atomically, so repeatable."""
     made = generate(settings, shard.split, range(shard.start, shard.stop))
     if settings.collect.frames == "stored":
-        camera = camera_of(plant(settings.plant), settings.camera)
+        camera = camera_of(plant(settings.plant), settings.camera, settings.sensor)
         made = dataclasses.replace(made, frames=frames_of(camera, made.states, TOGETHER))
     with holding(directory, which):
         return write_shard(directory, shard, made, settings.plant, settings.as_dict())

@@ -61,6 +61,7 @@ class Evaluation:
     def alike(self) -> dict[str, Any]:
         """Return what must agree in all runs that are compared."""
         sections = {name: self.config[name] for name in ("protocol", "conditions", "collect")}
+        sections["sensor"] = self.config.get("sensor", {})
         clean = (*curves.CLEAN, "start")
         sections["collect"] = {k: v for k, v in sections["collect"].items() if k in clean}
         return {key: self.result[key] for key in ALIKE} | dotted(sections) | self.grids

@@ -19,7 +19,7 @@ from hjepa_cli.core.datasets.dataset import (
 )
 from hjepa_cli.core.plants.control_law import control_law, control_of
 from hjepa_cli.core.plants.frames import frames_of
-from hjepa_cli.core.plants.named import camera_in, camera_of
+from hjepa_cli.core.plants.named import camera_in, camera_of, sensor_in
 from hjepa_cli.core.plants.recorded import Recorded
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.errors import HjepaError, MissingInputError, UsageError, require
@@ -252,7 +252,7 @@ def forces(applied_n: np.ndarray, system: System) -> str:
 
 def data_camera(data: Dataset) -> Camera:
     """Return the camera that a dataset's pictures are of."""
-    return camera_of(data.kind, camera_in(data.settings))
+    return camera_of(data.kind, camera_in(data.settings), sensor_in(data.settings))
 
 
 def _shown(value: object) -> object:

@@ -10,7 +10,7 @@ from typing import Any
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
-from hjepa_cli.core.plants.named import camera_of, plant_of
+from hjepa_cli.core.plants.named import camera_of, plant_of, seen_as_trained, sensor_in
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, Unavailable, UsageError
 from hjepa_cli.output.screen import Screen
@@ -62,7 +62,8 @@ def run(
     secret = key_for(address, "--server", key)
     bundle, kind = open_bundle(model), plant_of(settings)
     check_plant(bundle, settings)
-    if not same_camera(bundle.manifest["camera"], camera_of(kind, settings.camera)):
+    trained_with = camera_of(kind, settings.camera, sensor_in(bundle.manifest["camera"]))
+    if not same_camera(bundle.manifest["camera"], trained_with):
         raise DataError(
             f"{model} was exported with another camera than plant {kind.name} has now",
             hint=exported_by(model),
@@ -74,7 +75,7 @@ def run(
 
         def simulated() -> Camera:
             moved = actual_plant(settings.plant, settings.conditions)
-            seen = actual_camera(settings)
+            seen = actual_camera(seen_as_trained(settings, bundle.manifest["camera"]))
             plants.append(
                 SimulatedPlant(moved, seen, settings.protocol, settings.seed, FIRST_DEVICE)
             )

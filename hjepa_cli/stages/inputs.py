@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hjepa_cli.compute.device import resolve_device
-from hjepa_cli.config.schema import RECORDED, CameraSettings, RecordedSettings, Settings
+from hjepa_cli.config.schema import (
+    RECORDED,
+    CameraSettings,
+    RecordedSettings,
+    Settings,
+)
 from hjepa_cli.core.datasets.dataset import (
     Dataset,
     Trajectories,
@@ -24,7 +29,7 @@ from hjepa_cli.core.networks.model import encode_frames
 from hjepa_cli.core.plants.conditions import vary
 from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.frames import frames_of
-from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, plant_of
+from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, plant_of, sensor_in
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.core.training.batches import shift_sideways
 from hjepa_cli.core.training.rendered import RenderedSplit
@@ -88,7 +93,8 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
             "or pass --dataset DIR",
         )
     data = load_dataset(path, settings.plant)
-    if not same_camera(data.camera, camera_of(kind, camera_in(data.settings))):
+    taken_by = camera_of(kind, camera_in(data.settings), sensor_in(data.settings))
+    if not same_camera(data.camera, taken_by):
         raise DataError(
             f"dataset {path} was collected with another camera than plant {kind.name} has now",
             hint=f"hjepa collect --plant {kind.name}",
@@ -99,15 +105,18 @@ def open_dataset(path: Path | None, settings: Settings) -> Dataset:
 def brought_along(settings: Settings, record: Mapping[str, Any], where: object) -> Settings:
     """Return settings with what a dataset or a checkpoint, ``where``, brings along in its own.
 
-    That is the law, the size of pictures and, of a recorded plant, all that is known of it. Unless
-    that says what a mirror does, networks do not commute with one; and nobody knows what its
-    pictures show when they are moved.
+    That is the law, the size of pictures, the camera's sensor and, of a recorded plant, all that is
+    known of it. Unless that says what a mirror does, networks do not commute with one; and nobody
+    knows what its pictures show when they are moved.
 
     Raises:
         DataError: it holds no valid law.
     """
     settings = dataclasses.replace(
-        settings, control=control_of(record, where), camera=camera_in(record)
+        settings,
+        control=control_of(record, where),
+        camera=camera_in(record),
+        sensor=sensor_in(record),
     )
     if settings.plant != RECORDED:
         return settings
@@ -144,6 +153,11 @@ def check_same_plant(metadata: Mapping[str, Any], settings: Settings, what: str)
             f"the dataset has {shown(settings.camera)}",
             hint="hjepa train-encoder, with this dataset",
         )
+    if sensor_in(metadata["settings"]) != settings.sensor:
+        raise DataError(
+            f"{what} was trained on pictures of another sensor than the dataset has",
+            hint="hjepa train-encoder, with this dataset",
+        )
     if theirs == RECORDED and plant_in(theirs, metadata["settings"]) != plant_of(settings):
         raise DataError(
             f"{what} was trained on recordings of another plant than the dataset has",
@@ -168,7 +182,7 @@ def render(
     kind = plant_of(settings)
     limit_n, frames = kind.force_limit_n, trajectories.frames
     if frames is None:
-        camera = camera_of(kind, settings.camera)
+        camera = camera_of(kind, settings.camera, settings.sensor)
         count = len(trajectories)
         parts = []
         with screen.progress("render", count, "trajectories") as bar:

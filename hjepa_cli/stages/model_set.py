@@ -18,7 +18,7 @@ from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.workers import ModelFile
 from hjepa_cli.core.networks.model import Model
-from hjepa_cli.core.plants.named import plant_of
+from hjepa_cli.core.plants.named import plant_of, seen_as_trained
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS
@@ -197,12 +197,15 @@ def open_model_set(
 def under_law_of(model: Model, settings: Settings) -> Settings:
     """Return settings with the law that a model learned, and its pictures, for all beside it.
 
-    A ceiling is nobody's to learn: that of the settings stays where the model brings none.
+    A ceiling is nobody's to learn: that of the settings stays where the model brings none. A sensor
+    that they set stays too.
     """
-    found = brought_along(settings, model.metadata["settings"], model.digest)
+    record = model.metadata["settings"]
+    found = brought_along(settings, record, model.digest)
     ceiling = found.control.ceiling_gains_n or settings.control.ceiling_gains_n
     control = dataclasses.replace(found.control, ceiling_gains_n=ceiling)
-    return dataclasses.replace(found, control=control)
+    sensor = seen_as_trained(settings, record).sensor
+    return dataclasses.replace(found, control=control, sensor=sensor)
 
 
 def how_to_train(method: str, settings: Settings) -> str:

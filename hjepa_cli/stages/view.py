@@ -134,6 +134,7 @@ def run(
     if not live:
         out = files.target(out)
     models = open_viewable(settings, screen, checkpoint)
+    settings = models.settings  # with the law and the camera that the model brings along
     link = make_link(settings, models.model, devices, snr_db, delivery, gap_steps)
     screen.say(link.label + link.late)
     probe = fit_probe(settings, models.model, screen)

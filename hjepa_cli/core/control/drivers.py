@@ -24,7 +24,7 @@ from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera
-from hjepa_cli.core.plants.named import plant
+from hjepa_cli.core.plants.named import plant, seen_as_trained
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, UsageError, choices
 from hjepa_cli.plugins import CODECS, METHODS
@@ -77,6 +77,8 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
         )
     if METHODS[name].needs_model and (model is None or name not in methods_of(model)):
         raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")
+    if model:
+        settings = seen_as_trained(settings, model.metadata["settings"])
     driver: Driver = METHODS[name].build(settings, model)
     if not driver.uses_link:
         return dataclasses.replace(driver, name=late(name, steps))

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from hjepa_cli.config.schema import RECORDED, CameraSettings
+from hjepa_cli.config.schema import RECORDED, CameraSettings, SensorSettings
 from hjepa_cli.core.datasets.importing import arrays as arrays_of
 from hjepa_cli.core.datasets.importing.assembly import Assembly
 from hjepa_cli.core.datasets.importing.prepared import Options, Prepared, prepare
@@ -89,6 +89,7 @@ class _SplitEntry(msgspec.Struct):
 class _Config(msgspec.Struct):
     collect: dict[str, Any] = {}
     camera: CameraSettings = CameraSettings()
+    sensor: SensorSettings = SensorSettings()
 
 
 class _Manifest(msgspec.Struct):

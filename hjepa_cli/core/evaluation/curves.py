@@ -87,6 +87,8 @@ class Digest:
             "embedding": values["encoder"]["embedding"],
             "clean": clean,
         }
+        if sensor := values.get("sensor"):
+            measured["sensor"] = sensor
         if system := definition(values["plant"]):
             measured["system"] = system
         if control := values.get("control"):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hjepa_cli.compute.device import autocast, compute_dtype, resolve_device
+from hjepa_cli.config.schema import CameraSettings, SensorSettings
 from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
@@ -23,7 +24,7 @@ from hjepa_cli.core.networks.photometry import FITS
 from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
 from hjepa_cli.core.plants.frames import LONGEST
-from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in
+from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, sensor_in
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.plugins import METHODS
@@ -164,7 +165,7 @@ def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
     """
     metadata, found = check_metadata(checkpoint), f"checkpoint {checkpoint.path}"
     architecture, kind = metadata["architecture"], plant_in(metadata["plant"], metadata["settings"])
-    camera = camera_of(kind, camera_in(metadata["settings"]))
+    camera = camera_of(kind, *_seen_by(metadata))
     if "camera" in metadata and not same_camera(metadata["camera"], camera):
         raise DataError(
             f"{found} was trained on another camera's pictures than plant {kind.name} has now",
@@ -215,7 +216,7 @@ def check_metadata(checkpoint: Checkpoint) -> Mapping[str, Any]:
                 for name, value in metadata["architecture"].items()
             )
         )
-        plant_in(metadata["plant"], metadata["settings"])
+        camera_of(plant_in(metadata["plant"], metadata["settings"]), *_seen_by(metadata))
         good &= camera_in(metadata["architecture"]) == camera_in(metadata["settings"])
     except (KeyError, TypeError, ValueError, UsageError):
         good = False
@@ -230,6 +231,11 @@ def check_metadata(checkpoint: Checkpoint) -> Mapping[str, Any]:
                 hint="add --plugin with the file of the method that it was trained for",
             ) from None
     return metadata
+
+
+def _seen_by(metadata: Mapping[str, Any]) -> tuple[CameraSettings, SensorSettings]:
+    """Return the size of a checkpoint's pictures, and the sensor that took them."""
+    return camera_in(metadata["architecture"]), sensor_in(metadata["settings"])
 
 
 def tensors_of(modules: nn.ModuleDict) -> dict[str, NDArray[Any]]:
@@ -286,7 +292,7 @@ class Model:
             {**UNSAID, **self.architecture}[k] for k in ("frames", "frame_gap")
         )
         self.look: tuple[int, int] = (self.frames, frame_gap)
-        self.camera = camera_of(kind, camera_in(self.architecture))
+        self.camera = camera_of(kind, *_seen_by(metadata))
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
         is_reflex = self.architecture["kind"] == "reflex"

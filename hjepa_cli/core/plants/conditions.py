@@ -57,7 +57,8 @@ def actual_camera(settings: Settings) -> Camera:
     Raises:
         UsageError: as of :func:`actual_plant`.
     """
-    camera = camera_of(actual_plant(settings.plant, settings.conditions), settings.camera)
+    devices = actual_plant(settings.plant, settings.conditions)
+    camera = camera_of(devices, settings.camera, settings.sensor)
     parts = pictured(settings.conditions)
     for one in parts:
         if one.of_colours and settings.camera.grey:

@@ -68,10 +68,17 @@ def shot(pictures: Pictures, width: float, random: Generator) -> Pictures:
 
 def bayer(pictures: Pictures, width: float, random: Generator) -> Pictures:
     """See one colour per pixel (RGGB), with noise in each, and fill in the others by neighbours."""
+    return demosaiced(noise(pictures, width, random))
+
+
+def demosaiced(raw: Pictures) -> Pictures:
+    """Keep one colour per pixel (RGGB), and fill in the others by neighbours.
+
+    Each colour is the mean of what is seen of it in 3 × 3 pixels, weighted [1 2 1] both ways.
+    """
     from scipy import ndimage
 
-    raw = noise(pictures, width, random)
-    seen = np.zeros(pictures.shape[2:], np.float32)
+    seen = np.zeros(raw.shape[2:], np.float32)
     seen[0::2, 0::2, 0] = seen[0::2, 1::2, 1] = seen[1::2, 0::2, 1] = seen[1::2, 1::2, 2] = 1
     near = np.outer([1, 2, 1], [1, 2, 1]).astype(np.float32)[:, :, None]
     weight = ndimage.convolve(seen, near, mode="nearest")

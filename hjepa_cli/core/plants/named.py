@@ -1,5 +1,6 @@
 """Plants are found by their names, as users give them."""
 
+import dataclasses
 import hashlib
 import inspect
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hjepa_cli import plugins
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import CameraSettings, RecordedSettings, Settings
+from hjepa_cli.config.schema import CameraSettings, RecordedSettings, SensorSettings, Settings
 from hjepa_cli.core.arrays import Floats, array_from, described, finite
 from hjepa_cli.core.plants.cartpole import camera
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
@@ -20,11 +21,13 @@ from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 from hjepa_cli.core.plants.frames import FRAME_SHAPE
 from hjepa_cli.core.plants.recorded import Recorded, RecordedCamera
 from hjepa_cli.core.plants.resizing import Resized
+from hjepa_cli.core.plants.sensor import Sensed
 from hjepa_cli.core.plants.system import Camera as SystemCamera
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.errors import ArrayError, UsageError
 
 VERSIONED = ("desktop", "gym")
+IDEAL = SensorSettings()
 START = np.array([0.03, 0.1, 0.08, 0.5])  # m, m/s, rad, rad/s: where a seeded CartPole starts
 
 
@@ -92,12 +95,44 @@ def camera_in(settings: Mapping[str, Any]) -> CameraSettings:
         raise UsageError(f"no size of pictures: {flaw}") from None
 
 
-def camera_of(kind: System, size: CameraSettings) -> SystemCamera:
-    """Return a plant's camera, its pictures resized by area where ``size`` is not their own."""
+def sensor_in(record: Mapping[str, Any]) -> SensorSettings:
+    """Return the sensor in settings of a dataset or a checkpoint, or in a camera's manifest.
+
+    Raises:
+        UsageError: it is none.
+    """
+    try:
+        return msgspec.convert(record.get("sensor", {}), SensorSettings)
+    except (msgspec.ValidationError, AttributeError) as flaw:
+        raise UsageError(f"no sensor of a camera: {flaw}") from None
+
+
+def seen_as_trained(settings: Settings, record: Mapping[str, Any]) -> Settings:
+    """Return settings with the sensor that a model was trained with, unless they have their own.
+
+    ``record`` is what is known of the model: its settings, or the manifest of its camera.
+
+    Raises:
+        UsageError: it names no sensor.
+    """
+    own = settings.sensor != IDEAL
+    return settings if own else dataclasses.replace(settings, sensor=sensor_in(record))
+
+
+def camera_of(kind: System, size: CameraSettings, sensor: SensorSettings = IDEAL) -> SystemCamera:
+    """Return a plant's camera, its pictures resized by area where ``size`` is not their own.
+
+    A ``sensor`` that is not ideal takes them then.
+
+    Raises:
+        UsageError: the plant does not move as the sensor's exposure needs it.
+    """
     if isinstance(kind, Recorded):
         return RecordedCamera(size.frame_shape)
     camera = kind.camera()
-    return camera if size.frame_shape == FRAME_SHAPE else Resized(camera, size.frame_shape)
+    if size.frame_shape != FRAME_SHAPE:
+        camera = Resized(camera, size.frame_shape)
+    return Sensed(camera, kind, sensor) if sensor.works else camera
 
 
 def definition(name: str) -> str | None:
