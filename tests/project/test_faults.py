@@ -161,6 +161,12 @@
 | 48 | figures that overwrite each other | test_small_things.py::test_figures_of_two_runs_of_a_stage_have_two_names |
 | 48 | a notebook's variables | test_small_things.py::test_a_notebook_s_backend_does_not_matter |
 | 48 | nobody within reach | test_small_things.py::test_a_hall_that_covers_few_says_so |
+| 49 | pictures that show nothing known | test_familiarity.py::test_garbage_is_flagged_and_ordinary_packets_are_not |
+| 49 | a camera that is frozen | test_familiarity.py::test_a_camera_that_shows_the_same_for_long_is_flagged |
+| 49 | flags without end | test_familiarity.py::test_flagged_packets_are_kept_back_but_no_more_than_the_limit_in_a_row |
+| 49 | conditions that there are not | test_stress.py::test_what_is_no_condition_is_refused |
+| 49 | frames that a device has forgotten | test_frames_apart.py::test_frames_that_a_device_has_forgotten_are_refused |
+| 49 | an exposure of more than a step | test_sensor.py::test_what_a_camera_cannot_have_is_refused |
 """
 
 import re
@@ -170,7 +176,7 @@ import pytest
 from test_benchmarks import load
 
 ROWS = re.findall(r"^\| (\d+) \| (.+?) \| (test_\w+\.py)::(test_\w+) \|$", __doc__, flags=re.M)
-FAULTS = 48  # kinds: 24 that have happened to others, then those found by trying
+FAULTS = 49  # kinds: 24 that have happened to others, then those found by trying
 GUARDS = load("guards")
 
 
