@@ -109,7 +109,7 @@ def draw_devices(
         if not devices.any():
             nobody.append(text)
             continue
-        seen = np.where(devices > 0, devices, np.nan)
+        seen = np.where(devices > 0, devices, np.nan) if asked.logarithmic() else devices
         named.append(
             draw_line(axes, method, list(curves), snr_db, seen, points[:, 2:], text, scale=0.8)
         )

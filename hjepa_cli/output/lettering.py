@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from hjepa_cli.core.arrays import Floats
 
@@ -86,7 +86,9 @@ def name_ends(figure: Figure, axes: Axes, lines: Sequence[Named], notes: Sequenc
 
 
 def note(figure: Figure, text: str) -> None:
-    """Write a line of small letters below a figure."""
+    """Write a line of small letters below a figure, once."""
+    if text in (legend.get_title().get_text() for legend in figure.legends):
+        return
     figure.legend(
         [],
         [],
@@ -134,12 +136,12 @@ def _same(one: Floats, other: Floats) -> bool:
 
 
 def tidy(figure: Figure) -> None:
-    """Choose the ticks of all logarithmic axes so that the numbers have room; lay out first."""
+    """Choose the ticks of logarithmic axes, where nobody has, so that the numbers have room."""
     figure.draw_without_rendering()
     for axes in figure.axes:
         box = axes.bbox
         for axis, length in ((axes.xaxis, box.width), (axes.yaxis, box.height)):
-            if axis.get_scale() == "log":
+            if axis.get_scale() == "log" and not isinstance(axis.get_major_locator(), FixedLocator):
                 across = axis is axes.xaxis
                 _log_ticks(axis, length * 72 / figure.dpi, across=across)
 
