@@ -365,7 +365,7 @@ def draw_errors(
     exact = [name for name, entry in entries.items() if max(entry["nmae"]) <= ZERO_ERROR]
     shown = {name: entry for name, entry in entries.items() if name not in exact}
     named, windows = [], windows_of(shown)
-    for place, (method, entry) in enumerate(shown.items()):
+    for place, (method, entry) in enumerate(shown.items() if windows else ()):
         where = np.arange(len(windows)) + 0.7 * ((place + 0.5) / len(shown) - 0.5)
         values = np.array([entry["nmae_windows"][window] for window in windows], float)
         ends = np.array([entry["nmae_windows_ci95"][window] for window in windows], float)
@@ -385,9 +385,13 @@ def draw_errors(
 
 
 def windows_of(entries: Entries) -> list[str]:
-    """Return the windows of steps that errors are averaged over, in the order of time."""
+    """Return the windows of steps that errors were averaged over, in the order of time."""
     first: Mapping[str, Any] = next(iter(entries.values()), {})
-    return sorted(first.get("nmae_windows", {}), key=lambda window: int(window.split("-")[0]))
+    every = [entry["nmae_windows"] for entry in entries.values()]
+    measured = [
+        name for name in first.get("nmae_windows", {}) if None not in [of[name] for of in every]
+    ]
+    return sorted(measured, key=lambda window: int(window.split("-")[0]))
 
 
 def in_ms(window: str, step_s: float) -> str:

@@ -17,6 +17,7 @@ from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.storage import runs
 
+NEEDED = {"bench-link": ("--model", "DIR")}  # by stages beside settings
 LARGEST = 1e100  # bounds beyond anything that is measured keep arithmetic in range
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
@@ -320,9 +321,9 @@ def check_config(stage: str, config: Mapping[str, Any], directory: Path) -> None
 
 def damaged(directory: Path, stage: str, reason: object, name: str = runs.RESULT) -> DataError:
     """Return the error of a run whose file is not what its stage writes."""
+    words = ["hjepa", stage, "--config", directory / runs.CONFIG, *NEEDED.get(stage, ())]
     return DataError(
-        f"{directory / name} lacks what a {stage} run has: {reason}",
-        hint=shell(["hjepa", stage, "--config", directory / runs.CONFIG]),
+        f"{directory / name} lacks what a {stage} run has: {reason}", hint=shell(words)
     )
 
 

@@ -12,7 +12,8 @@ import pytest
 pytest.importorskip("matplotlib")
 from hjepa_cli.config.checks import compared_methods
 from hjepa_cli.output import figures
-from hjepa_cli.output.figures import TWO_COLUMNS_IN, comparison_figure
+from hjepa_cli.output.comparison import comparison_figure, trainings_figure
+from hjepa_cli.output.looks import PAGE_IN, Looks
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.zoo import zoo_directory
 
