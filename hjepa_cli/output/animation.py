@@ -325,7 +325,7 @@ def _palette(pictures: Pictures) -> Image.Image:
     picture = Image.new("RGB", (width, len(steps) * height))
     for place, k in enumerate(steps):
         picture.paste(pictures.draw(k), (0, place * height))
-    kept = (*ARRIVED, *LOST, *FLAGGED)
+    kept = (*ARRIVED, *LOST, *FLAGGED, *PAPER, 255, 255, 255)
     common = picture.quantize(COLOURS - len(kept) // 3).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*common[: 3 * COLOURS - len(kept)], *kept])

@@ -17,7 +17,7 @@ NAME_PT, NOTE_PT = 7, 6
 LINE_HEIGHT = 1.2
 AWAY = 0.05  # of a panel's width, from its edge to the names
 SAME = 0.02  # of a panel's height: lines no further apart anywhere are drawn on each other
-LIES_ON = "≈ lies on the line named above it"
+LIES_ON = "≈ lies on the line that is named above"
 DIGIT_PT = 0.7  # of a letter's size, about
 APART_PT = 5  # between the numbers at two ticks
 
@@ -45,10 +45,11 @@ def name_ends(figure: Figure, axes: Axes, lines: Sequence[Named], notes: Sequenc
         range(len(lines)),
         key=lambda one: (-round(ends[one] / SAME), -reached[one][:, 1].mean()),
     )
-    lying = [
-        upper is not None and _same(reached[upper], reached[one])
-        for upper, one in zip([None, *highest], highest, strict=False)
-    ]
+    lying: list[bool] = []
+    upper = None  # the last line that lies on no other
+    for one in highest:
+        lying.append(upper is not None and _same(reached[upper], reached[one]))
+        upper = upper if lying[-1] else one
     notes = [*notes, *([LIES_ON] if any(lying) else [])]
     if notes:
         note(figure, "; ".join(notes))

@@ -204,8 +204,9 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
     for name, entry in result["methods"].items():
         if reason := curves.flaw(entry):
             return f"method '{name}': {reason}"
-        if "nmae_every_step" not in entry:
-            return f"method '{name}': no 'nmae_every_step' (an older version?)"
+        for key in ("nmae_every_step", "nmae_windows_ci95"):
+            if key not in entry:
+                return f"method '{name}': no '{key}' (an older version?)"
         if not steps == len(entry["nmae"]) == len(entry["nmae_ci95"]):
             return f"method '{name}': 'nmae' is not over the horizon"
         if _grids(entry) != _grids(first):
