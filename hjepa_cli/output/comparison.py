@@ -26,24 +26,18 @@ def comparison_figure(
 ) -> Figure:
     """Draw the paper's Fig. 3: (a) NMAE, (b) bits per transmission, (c) score, with 95 % intervals.
 
-    Errors are with a packet at every step, and by window of the time since the only one. Where all
-    methods send as many bits, a line of text says so.
+    Errors are with a packet at every step, and by window of the time since the only one. Bits are
+    exact and mostly equal: a line of text says them.
     """
     height_in = max(AROUND_IN + ROW_IN * len(entries), LEAST_IN)
     figure = Figure(figsize=(looks.PAGE_IN, height_in), layout="constrained")
-    bits = {name: entry["bits_per_transmission"] for name, entry in entries.items()}
-    sending = {name: sent for name, sent in bits.items() if sent}
-    alike = len(set(sending.values())) == 1
-    title, text = asked.titled(""), ""
-    if alike:
-        text = f"(b) every method sends {next(iter(sending.values())):,} bits per transmission"
+    title, text = asked.titled(""), bits_text(entries, asked)
     _close(figure)
     figure.suptitle("\n".join(filter(None, (title, text))), fontsize=figures.RC["axes.titlesize"])
     left, right = figure.subfigures(1, 2, width_ratios=(4.1, 3.0))
+    logarithmic = asked.logarithmic(usual=True)
     columns = error_columns(entries, step_s)
-    if not alike:
-        columns.append(("(b) bits per\npacket", _bits))
-    exact = rows_panel(left, entries, columns, asked, logarithmic=asked.logarithmic(usual=True))
+    exact = rows_panel(left, entries, columns, asked, logarithmic=logarithmic)
     left.supxlabel("(a) NMAE of the force", fontsize=figures.RC["axes.titlesize"])
     axes = right.subplots()
     named = figures.draw_scores(axes, entries, "gap", acceptable_score, step_s, asked)
@@ -105,9 +99,19 @@ def _scaled(
     return [1e3 * step_s * number for number in (entry[value], *entry[interval])]
 
 
-def _bits(entry: Mapping[str, Any]) -> Sequence[Any] | None:
-    bits = entry["bits_per_transmission"]
-    return [bits] * 3 if bits else None
+def bits_text(entries: Entries, asked: Looks) -> str:
+    """Say how many bits a transmission has, of each method whose number is not the usual one."""
+    sent: dict[int, list[str]] = {}
+    for name, entry in entries.items():
+        if entry["bits_per_transmission"]:
+            sent.setdefault(entry["bits_per_transmission"], []).append(asked.named(name))
+    usual = max(sent, key=lambda bits: len(sent[bits]), default=0)
+    others = [f"{bits:,} {', '.join(names)}" for bits, names in sent.items() if bits != usual]
+    if not sent:
+        return ""
+    if not others:
+        return f"(b) every method sends {usual:,} bits per transmission"
+    return f"(b) bits per transmission: {'; '.join([*others, f'all others {usual:,}'])}"
 
 
 def rows_panel(
@@ -141,7 +145,7 @@ def rows_panel(
         panel.tick_params(axis="x", labelsize=6)
         panel.tick_params(axis="y", length=0)
         panel.grid(visible=True)
-        if (panel in errors and logarithmic) or "bits" in title:
+        if panel in errors and logarithmic:
             panel.set_xscale("log")
         elif panel not in errors:
             panel.set_xlim(left=0)

@@ -275,6 +275,7 @@ def wire_figure(result: Mapping[str, Any], asked: Looks = looks.PLAIN) -> Figure
     ages = {int(age): count for age, count in result["ages"].items()}
     answers = max(sum(ages.values()), 1)
     left.bar(list(ages), [count / answers for count in ages.values()], color="#0072B2")
+    lettering.count_ticks(left.xaxis)
     left.set_xlabel("Steps from picture to force")
     left.set_ylabel("Share of answers")
     driven = {name: count for name, count in result["sources"].items() if count}

@@ -152,15 +152,19 @@ def _log_ticks(axis: Axis, length_pt: float, *, across: bool) -> None:
     low, high = sorted(axis.get_view_interval())
     size_pt = _letters_pt(axis)
     decades = max(math.log10(high / low), 1e-9)
-    for subs in ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,)):
-        ticks = [
-            sub * 10.0**power
-            for power in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-            for sub in subs
-        ]
-        ticks = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
-        if len(ticks) < 2 and len(subs) > 1 and decades < 1:
-            break
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    inside = low * (1 - 1e-9), high * (1 + 1e-9)
+    for subs, every in (((1, 2, 5), 1), ((1, 3), 1), ((1,), 1), ((1,), 2), ((1,), 4)):
+        ticks = max(
+            (
+                [sub * 10.0**power for power in powers if power % every == first for sub in subs]
+                for first in range(every)
+            ),
+            key=lambda ticks: sum(inside[0] <= tick <= inside[1] for tick in ticks),
+        )
+        ticks = [tick for tick in ticks if inside[0] <= tick <= inside[1]]
+        if len(ticks) < 2 and decades < 1:  # between two of them
+            ticks = [tick for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high]
         places = [math.log10(tick / low) / decades * length_pt for tick in ticks]
         widths = [DIGIT_PT * size_pt * len(_plain(tick)) if across else size_pt for tick in ticks]
         gaps = [
@@ -172,7 +176,7 @@ def _log_ticks(axis: Axis, length_pt: float, *, across: bool) -> None:
         if all(gap >= (APART_PT if across else APART_PT / 2) for gap in gaps):
             break
     else:
-        ticks = ticks[:: math.ceil(len(ticks) / 2)]
+        ticks = ticks[:1]
     axis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
     axis.set_minor_formatter(NullFormatter())
     axis.set_minor_locator(LogLocator(subs=tuple(range(2, 10))))
