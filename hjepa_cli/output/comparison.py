@@ -127,14 +127,18 @@ def rows_panel(
     Columns of errors share their axis. Return the methods that make none and have no mark there.
     """
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
-    methods, exact = list(entries), set()
+    methods = list(entries)
+    windows = figures.windows_of(entries)
+    exact = [
+        name
+        for name, entry in entries.items()
+        if max((entry["nmae_windows"][of] for of in windows), default=1) <= figures.ZERO_ERROR
+    ]
     found: dict[str, dict[str, Sequence[Any] | None]] = {}
     for title, value in columns:
         found[title] = {name: value(entry) for name, entry in entries.items()}
         if _is_error(title):
-            none = [name for name, of in found[title].items() if of and of[0] <= figures.ZERO_ERROR]
-            found[title] |= dict.fromkeys(none)
-            exact.update(none)
+            found[title] |= dict.fromkeys(exact)
     shown = [name for name in methods if any(of[name] for of in found.values())]
     errors = [panel for panel, (title, _) in zip(panels, columns, strict=True) if _is_error(title)]
     for panel, (title, _) in zip(panels, columns, strict=True):
@@ -158,7 +162,7 @@ def rows_panel(
     panels[0].set_yticks(range(len(shown)), [asked.named(name) for name in shown])
     for label, name in zip(panels[0].get_yticklabels(), shown, strict=True):
         label.set_color(figures.method_style(name, methods).colour)
-    return [asked.named(name) for name in methods if name in exact]
+    return [asked.named(name) for name in exact]
 
 
 def _is_error(title: str) -> bool:
