@@ -49,8 +49,8 @@ class Looks:
             if name not in METHODS and name not in SCHEDULERS:
                 known = choices(name, [*METHODS, *SCHEDULERS])
                 raise UsageError(f"--labels {one}: no method or scheduler '{name}'; {known}")
-            named[name] = text
-        return cls(title, named, log)
+            named[name] = _literal(text)
+        return cls(None if title is None else _literal(title), named, log)
 
     def wide(self) -> "Looks":
         """Return the same for the width of a page."""
@@ -67,6 +67,11 @@ class Looks:
     def logarithmic(self, *, usual: bool = False) -> bool:
         """Return whether the axis is logarithmic."""
         return usual if self.log is None else self.log
+
+
+def _literal(text: str) -> str:
+    """Return a text in which a dollar is one, and begins no formula."""
+    return text.replace("$", r"\$")
 
 
 PLAIN = Looks()

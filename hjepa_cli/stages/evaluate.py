@@ -101,8 +101,10 @@ def plan(
     remeasure: bool = False,
     further: Sequence[Path] | None = None,
     figure: bool = False,
+    labels: Sequence[str] | None = None,
 ) -> Plan:
     """Plan the loops of the methods whose curves are not there yet; arguments as of :func:`run`."""
+    Looks.of(labels=labels)
     if settings.plant == RECORDED:
         refuse_closed_loop(remeasure=remeasure, figure=figure)
         found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}

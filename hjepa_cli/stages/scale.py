@@ -133,8 +133,10 @@ def plan(
     verify: bool = False,
     further: Sequence[Path] | None = None,
     tolerance_steps: float | None = None,
+    labels: Sequence[str] | None = None,
 ) -> Plan:
     """Plan a count of devices; arguments as of :func:`run`."""
+    Looks.of(labels=labels)
     radio, protocol = settings.radio, settings.protocol
     grid_db = parse_snr(radio.snr_db)
     check_cell(radio, {"remeasure": remeasure}, settings.nr)

@@ -11,7 +11,7 @@ import pytest
 from command_line import assert_one_line_error, open_shell
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.output import page
+from hjepa_cli.output import looks, page
 from hjepa_cli.output.looks import COLUMN_IN, PAGE_IN
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import report
@@ -559,3 +559,17 @@ def test_what_a_figure_lacks_is_told_with_the_command_that_makes_it(shell):
         "hjepa train-encoder --config runs/train-encoder/0001/config.toml",
     ):
         assert command in outcome.err and f"again: {command}</p>" in text, command
+
+
+def test_a_wrong_label_is_refused_before_anything_is_planned(shell):
+    with shell.untouched():
+        for command in ("scale", "eval --figure", "compare --figures f"):
+            words = [*command.split(), "--labels", "hjeap=x"]
+            assert_one_line_error(shell(*words), 2, "no method or scheduler 'hjeap'")
+        assert_one_line_error(shell("scale", "--labels", "a=b", "--dry-run"), 2, "'a'")
+        assert_one_line_error(shell("eval", "--title", "x"), 2, "none is drawn", "--figure")
+
+
+def test_a_dollar_is_a_dollar():
+    assert looks.Looks.of(title="$1 and $2").titled("") == r"\$1 and \$2"
+    assert looks.Looks.of(labels=["hold=$"]).named("hold") == r"\$"
