@@ -16,6 +16,8 @@ import argparse
 import csv
 import hashlib
 import json
+import shlex
+import sys
 import tomllib
 from collections import Counter
 from pathlib import Path
@@ -34,6 +36,7 @@ from hjepa_cli.storage.files import write_json, write_text
 from hjepa_cli.storage.zoo import resolve_model
 
 COMPARED = "hjepa,ts-jepa-1,ts-jepa-4,linear,chunk-forces,hold-decay,hold,oracle"
+LABEL = "Delay from a packet's capture to the force (ms)"
 TUNED = ("hold-decay", "hold-decay-linear")
 CALLS_AT = (20, 80)  # steps between packets where calls are counted
 CALLS_DEVICES, CALLS_STEPS = 8, 400
@@ -151,7 +154,9 @@ def point(options: argparse.Namespace, stage: str, *of: Any) -> Path:
 
 def write(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
     """All rows as JSON, the table as CSV, the devices as a figure."""
-    write_json(options.out / "delay.json", {"checkpoint": str(options.checkpoint), "rows": rows})
+    document = {"command": shlex.join(["python", "benchmarks/delay.py", *sys.argv[1:]])}
+    document |= {"checkpoint": str(options.checkpoint), "snr_db": float(options.snr), "rows": rows}
+    write_json(options.out / "delay.json", document)
     with (options.out / "delay.csv").open("w", newline="") as file:
         table = csv.writer(file)
         head = ("delay_ms", "method", "note", "devices", "low", "high", "gap_steps", "low", "high")
@@ -173,8 +178,7 @@ def write(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
         for row in rows
         if row["devices"] is not None
     ]
-    label = "Delay from a packet's capture to the force (ms)"
-    figures.save(figures.devices_figure(drawn, snr_label=label), options.out / "delay.png")
+    figures.save(figures.devices_figure(drawn, snr_label=LABEL), options.out / "delay.png")
 
 
 if __name__ == "__main__":

@@ -305,7 +305,7 @@ class Shown(Target):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.runs = [self._evaluated(0), self._evaluated(1), self._scaled(), self._trained()]
-        self.page = report.page_template().make_module({"runs": (), "sections": (), "note": ""})
+        self.page = report.page_template().make_module(dict.fromkeys(report.PARTS, ()))
         self.good = {run: self._bytes(run) for run in self.runs}
         self.run, self.forged = self.runs[0], False
         self.expected = {run: self._printed(run) for run in self.runs}
@@ -337,7 +337,7 @@ class Shown(Target):
 
     def _printed(self, run: Path) -> Any:
         one = report.describe(run)
-        one["figures"] = []
+        one["figures"] = one["lacking"] = []
         screen = Screen(stdout=io.StringIO(), stderr=io.StringIO())
         try:
             text = str(self.page.section(one))

@@ -34,7 +34,9 @@ from matplotlib.figure import Figure
 
 from hjepa_cli.core.control.loop import LOOP_VERSION
 from hjepa_cli.core.statistics import student_interval
-from hjepa_cli.output import figures
+from hjepa_cli.core.style import PALETTE
+from hjepa_cli.output import figures, lettering
+from hjepa_cli.output.looks import PAGE_IN
 from hjepa_cli.stages.compare import differences
 
 STUDIES = Path(__file__).parent / "studies"
@@ -203,42 +205,47 @@ def write(
 
 
 def size_figure(measured: dict[str, dict[int, dict[str, Any]]], axis: str) -> Figure:
-    """Probes and control error of the rows' first method against what the rows are named by."""
-    sizes = [int(name) for name in measured]
+    """Probes and control error of the rows' first method against what the rows are named by.
 
-    def line(axes: Axes, label: str, marker: str, values: list[list[float]]) -> None:
-        middle = [float(np.mean(of)) for of in values]
-        axes.plot(sizes, middle, marker=marker, markersize=3, label=label)
-        if min(map(len, values)) > 1:
-            ends = np.array([student_interval(np.array(of)) for of in values])
-            axes.fill_between(sizes, *ends.T, alpha=0.18, linewidth=0)
+    Bands are 95 % intervals: Student's over seeds, of a single one the bootstrap's over rollouts.
+    """
+    sizes = np.array([int(name) for name in measured], float)
+    rows = [list(by_seed.values()) for by_seed in measured.values()]
+
+    def line(
+        axes: Axes, label: str, number: int, values: list[list[float]], alone: list[list[float]]
+    ) -> lettering.Named:
+        middle = np.array([float(np.mean(of)) for of in values])
+        colour = PALETTE[number]
+        axes.plot(sizes, middle, marker="o^sD"[number], markersize=3, color=colour, label=label)
+        several = min(map(len, values)) > 1
+        ends = [student_interval(np.array(of)).tolist() for of in values] if several else alone
+        if ends:
+            axes.fill_between(sizes, *np.array(ends).T, alpha=0.18, linewidth=0, color=colour)
+        return lettering.Named(label, colour, sizes, middle)
 
     with matplotlib.rc_context(figures.RC):
-        figure = Figure(figsize=(2 * figures.WIDTH_IN, 2.8), layout="constrained")
-        left, right = figure.subfigures(1, 2)
-        probes, errors = left.subplots(), right.subplots()
-        rows = [list(by_seed.values()) for by_seed in measured.values()]
-        for (probe, symbol), marker in zip(PROBES.items(), "o^sD", strict=True):
+        figure = Figure(figsize=(PAGE_IN, 2.6), layout="constrained")
+        probes, errors = figure.subplots(1, 2)
+        named: dict[Axes, list[lettering.Named]] = {probes: [], errors: []}
+        for number, (probe, symbol) in enumerate(PROBES.items()):
             r2 = [[result["health"]["probe_r2"][probe] for result in row] for row in rows]
-            line(probes, symbol, marker, r2)
+            named[probes].append(line(probes, symbol, number, r2, []))
         entries = [[next(iter(result["methods"].values())) for result in row] for row in rows]
-        for window, marker in zip(windows_of(measured), "o^sD", strict=False):
-            line(
-                errors,
-                f"{window} steps after a packet",
-                marker,
-                [[entry["nmae_windows"][window] for entry in row] for row in entries],
-            )
+        for number, window in enumerate(windows_of(measured)):
+            values = [[entry["nmae_windows"][window] for entry in row] for row in entries]
+            alone = [row[0].get("nmae_windows_ci95", {}).get(window) for row in entries]
+            known = alone if None not in alone else []
+            named[errors].append(line(errors, f"{window} steps", number, values, known))
         probes.set_ylabel("Held-out R² of a linear probe")
-        errors.set_ylabel("NMAE of the force")
+        errors.set_ylabel("NMAE of the force since a packet")
         errors.set_ylim(bottom=0)
-        for axes in (probes, errors):
+        for axes, lines in named.items():
             axes.set_xscale("log", base=2)
-            axes.set_xticks(sizes, labels=[str(size) for size in sizes])
+            axes.set_xticks(sizes, labels=[f"{size:g}" for size in sizes])
             axes.set_xlabel(axis)
             axes.grid(visible=True)
-        for side in (left, right):
-            side.legend(loc="outside lower center", ncols=2, frameon=False)
+            lettering.name_ends(figure, axes, lines, ())
         return figure
 
 

@@ -30,6 +30,7 @@ SHARED = (
     *("dataset", "encoder", "checkpoint", "remeasure", "figure", "verify", "tolerance_steps"),
 )  # by stages
 LOOP = ("methods", "protocol")
+LOOKS = ("title", "labels", "log")  # of figures
 LINK = ("protocol.delay_steps", "protocol.jitter_steps", "protocol.downlink_loss")
 MEASURED = (
     *(*LOOP, "protocol.process_noise", "protocol.plant_spread", "protocol.payload"),
@@ -212,12 +213,12 @@ COMMANDS = (
     staged(
         "eval",
         takes=(
-            *(*MEASURED, "stress", "remeasure", "figure", "checkpoint", "dataset:clean", "out"),
-            *(*COMPUTED, *PARALLEL),
+            *(*MEASURED, "stress", "remeasure", "figure", *LOOKS, "checkpoint", "dataset:clean"),
+            *("out", *COMPUTED, *PARALLEL),
         ),
         prepare=_figure_of_all,
     ),
-    staged("scale", takes=(*SCALE, *COMPUTED, *PARALLEL), check=_check_cell),
+    staged("scale", takes=(*SCALE, *LOOKS, *COMPUTED, *PARALLEL), check=_check_cell),
     staged(
         "survive",
         takes=(
@@ -256,7 +257,7 @@ COMMANDS = (
         "report",
         "Write what runs found as one HTML file: figures, tables, settings, commands.",
         Imported("hjepa_cli.stages.report:run"),
-        ("paths:runs", "out:report", "figures", "formats"),
+        ("paths:runs", "out:report", "figures", "formats", "film", *LOOKS),
         product="report",
         panel=TOOLS,
     ),
@@ -264,7 +265,7 @@ COMMANDS = (
         "compare",
         "Average evaluations over training seeds: means, 95 % intervals, paired differences.",
         Imported("hjepa_cli.stages.compare:run"),
-        ("paths:evaluations", "methods:compare", "figures:compare", "formats"),
+        ("paths:evaluations", "methods:compare", "figures:compare", "formats", *LOOKS),
         panel=TOOLS,
     ),
     Command(

@@ -35,7 +35,7 @@ from hjepa_cli.plugins import LAWS, METHODS, PHYS, PLANTS, SCHEDULERS
 
 DATA, MODEL, LOOP, RADIO = "Data", "Model", "Closed loop", "Radio cell"
 WIRE, UPLINK, DOWNLINK = "Wire", "Uplink", "Downlink"
-SETTINGS, FILES, SCREEN = "Settings", "Files", "Screen"
+SETTINGS, FILES, FIGURES, SCREEN = "Settings", "Files", "Figures", "Screen"
 PANELS = {  # of help, by section
     "collect": DATA, "encoder": MODEL, "hierarchy": MODEL, "protocol": LOOP, "conditions": LOOP,
     "radio": RADIO, "nr": RADIO, "survival": LOOP,
@@ -162,6 +162,22 @@ _FILES = {
     "checkpoint": _model(
         "--checkpoint",
         "Model to use: a zoo name or a path. Without it: the newest run's, else the zoo's.",
+    ),
+}
+_FIGURES = {
+    "film": Input(Path, "--film", "Film to show on the page: a GIF of hjepa view.", "FILE"),
+    "title": Input(str, "--title", "Title above the figures; an empty one leaves it out.", "TEXT"),
+    "labels": Input(
+        tuple[str, ...],
+        "--labels",
+        "What lines are called, as hjepa=H-JEPA, separated by commas. Without it: by their names.",
+        "NAME=TEXT,…",
+    ),
+    "log": Input(
+        bool,
+        "--log/--linear",
+        "Scale of the axis that may span decades: devices, errors, gaps. Without it: errors are "
+        "logarithmic.",
     ),
 }
 _ARGUMENTS = {
@@ -571,8 +587,9 @@ _SCREEN = {
 INPUTS = {
     name: dataclasses.replace(one, panel=one.panel or panel)
     for panel, listed in (
-        *((FILES, _FILES), ("", _ARGUMENTS), (DATA, _DATA), (DATA, _IMPORT), (LOOP, _LOOP)),
-        *((RADIO, _RADIO), (WIRE, _WIRE), (WIRE, _LINKS), (SETTINGS, _SETTINGS), (SCREEN, _SCREEN)),
+        *((FILES, _FILES), (FIGURES, _FIGURES), ("", _ARGUMENTS), (DATA, _DATA)),
+        *((DATA, _IMPORT), (LOOP, _LOOP), (RADIO, _RADIO), (WIRE, _WIRE), (WIRE, _LINKS)),
+        *((SETTINGS, _SETTINGS), (SCREEN, _SCREEN)),
     )
     for name, one in listed.items()
 }

@@ -14,7 +14,7 @@ class Style:
     first, dashed ones with smaller markers over them, and all stay visible.
     """
 
-    colour: str  # Okabe and Ito's palette, safe for colour-blind readers
+    colour: str  # a method's own, of Okabe and Ito's palette where it is in most figures
     marker: str
     line: Any = "-"
     hollow: bool = False
@@ -35,3 +35,5 @@ class Style:
 
 
 PLAIN = Style("#7F7F7F", "<", ":")  # of what has no style of its own
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's, in the order in which lines of no method take their colours."""

@@ -21,6 +21,7 @@ from hjepa_cli.core.evaluation.curves import Entry
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.statistics import student_interval
 from hjepa_cli.errors import DataError, MissingInputError, UsageError, require, shell
+from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.screen import Screen, span, tolerance
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.report import NO_RESULT, found_runs, stage_of
@@ -97,6 +98,9 @@ def run(
     methods: Sequence[str] | None = None,
     figures: Path | None = None,
     formats: Sequence[str] = ("pdf",),
+    title: str | None = None,
+    labels: Sequence[str] | None = None,
+    log: bool | None = None,
 ) -> dict[str, Any]:
     """Compare evaluations; return the document of ``--json``.
 
@@ -105,15 +109,20 @@ def run(
         paths: runs of ``eval``, or directories that hold some; none: ``runs/eval``.
         methods: these, in this order, the first against the others; default: all that were found.
         figures, formats: a directory for the paper's Fig. 3, with bands over trainings, and how.
+        title, labels, log: of the figure, as :meth:`hjepa_cli.output.looks.Looks.of`.
 
     Raises:
-        UsageError: no such method.
+        UsageError: no such method, or how a figure looks that is not drawn.
         MissingInputError: no runs, fewer than two trainings, or a method that a training lacks.
         DataError: runs of different plants, protocols or versions, two models of one seed, or a
             result that no ``eval`` wrote.
     """
     if methods is not None:
         check_methods(tuple(methods))
+    asked = Looks.of(title, labels, log)
+    if asked != Looks() and figures is None:
+        asks = "--title, --labels, --log and --linear say how a figure looks; none is drawn"
+        raise UsageError(asks, hint="hjepa compare --figures DIR, with them")
     if figures is not None:
         require("matplotlib", "a figure needs matplotlib", "plot")
     found = [open_evaluation(directory, methods) for directory in evaluations(paths)]
@@ -136,7 +145,9 @@ def run(
         "runs": [one.directory for one in found],
     }
     show(document, screen)
-    document["figures"] = [] if figures is None else draw(document, figures, formats, screen)
+    document["figures"] = []
+    if figures is not None:
+        document["figures"] = draw(document, asked, figures, formats, screen)
     return document
 
 
@@ -195,8 +206,9 @@ def flaw(result: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
     for name, entry in result["methods"].items():
         if reason := curves.flaw(entry):
             return f"method '{name}': {reason}"
-        if "nmae_every_step" not in entry:
-            return f"method '{name}': no 'nmae_every_step' (an older version?)"
+        for key in ("nmae_every_step", "nmae_windows_ci95"):
+            if key not in entry:
+                return f"method '{name}': no '{key}' (an older version?)"
         if not steps == len(entry["nmae"]) == len(entry["nmae_ci95"]):
             return f"method '{name}': 'nmae' is not over the horizon"
         if _grids(entry) != _grids(first):
@@ -441,17 +453,24 @@ def _spanned(found: Mapping[str, Any] | None, decimals: int) -> str | None:
 
 
 def draw(
-    document: Mapping[str, Any], directory: Path, formats: Sequence[str], screen: Screen
+    document: Mapping[str, Any],
+    asked: Looks,
+    directory: Path,
+    formats: Sequence[str],
+    screen: Screen,
 ) -> list[Path]:
     """Write the paper's Fig. 3, bands over trainings, as ``trainings.<format>``."""
-    from hjepa_cli.output.figures import comparison_figure, save
+    from hjepa_cli.output.comparison import comparison_figure
+    from hjepa_cli.output.figures import save
     from hjepa_cli.storage.files import make_directory
 
+    trainings = len(document["training_seeds"])
+    usual = f"{document['plant']}, mean of {trainings} trainings, 95 % CI"
     drawn = comparison_figure(
         document["methods"],
         acceptable_score=document["acceptable_score"],
         step_s=plant(document["plant"]).step_s,
-        title=f"{document['plant']}, mean of {len(document['training_seeds'])} trainings, 95 % CI",
+        asked=dataclasses.replace(asked, title=asked.titled(usual)),
     )
     make_directory(directory)
     paths = [save(drawn, directory / f"trainings.{kind}") for kind in formats]

@@ -4,6 +4,7 @@ A trained model (a run's or the zoo's) → closed-loop curves of every method, k
 all they depend on, and tables. ``scale`` takes the same curves (:mod:`hjepa_cli.stages.measuring`).
 """
 
+import dataclasses
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +15,7 @@ from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.screen import Screen, in_order
 from hjepa_cli.output.tables import show_evaluation, show_stress
 from hjepa_cli.stages import evaluate_offline, results
@@ -34,6 +36,9 @@ def run(
     remeasure: bool = False,
     further: Sequence[Path] | None = None,
     figure: bool = False,
+    title: str | None = None,
+    labels: Sequence[str] | None = None,
+    log: bool | None = None,
 ) -> dict[str, Any]:
     """Evaluate ``settings.methods``; return the document of ``--json``.
 
@@ -46,13 +51,18 @@ def run(
         further: models of methods that the first one does not hold; ``None`` looks for them.
         figure: draw the paper's Fig. 3, or scores under ``settings.stress``, into the run's
             directory.
+        title, labels, log: of the figure, as :meth:`hjepa_cli.output.looks.Looks.of`.
 
     Raises:
-        UsageError: unknown method or condition.
+        UsageError: unknown method or condition, or how a figure looks that is not drawn.
         MissingInputError: no such checkpoint or dataset, no model of any of the methods, or no
             matplotlib for ``figure``.
         DataError: a damaged file, one of another plant, or a figure of models of different seeds.
     """
+    asked = Looks.of(title, labels, log)
+    if asked != Looks() and not figure:
+        asks = "--title, --labels, --log and --linear say how a figure looks; none is drawn"
+        raise UsageError(asks, hint="hjepa eval --figure, with them")
     if settings.plant == RECORDED:
         refuse_closed_loop(remeasure=remeasure, figure=figure)
         found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}
@@ -78,7 +88,7 @@ def run(
             if "stress" in result:
                 show_stress(result, screen)
             if figure:
-                result["figures"] = draw(result, settings, record.directory, screen)
+                result["figures"] = draw(result, settings, asked, record.directory, screen)
         return result
 
 
@@ -91,8 +101,10 @@ def plan(
     remeasure: bool = False,
     further: Sequence[Path] | None = None,
     figure: bool = False,
+    labels: Sequence[str] | None = None,
 ) -> Plan:
     """Plan the loops of the methods whose curves are not there yet; arguments as of :func:`run`."""
+    Looks.of(labels=labels)
     if settings.plant == RECORDED:
         refuse_closed_loop(remeasure=remeasure, figure=figure)
         found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}
@@ -179,19 +191,23 @@ def stress_for(models: ModelSet, screen: Screen, record: Run) -> dict[str, Any]:
     }
 
 
-def draw(result: dict[str, Any], settings: Settings, directory: Path, screen: Screen) -> list[Path]:
+def draw(
+    result: dict[str, Any], settings: Settings, asked: Looks, directory: Path, screen: Screen
+) -> list[Path]:
     """Write the paper's Fig. 3, or scores under stress, as ``.png``, ``.svg`` and ``.pdf``."""
-    from hjepa_cli.output.figures import comparison_figure, save, stress_figure
+    from hjepa_cli.output.comparison import comparison_figure
+    from hjepa_cli.output.figures import save, stress_figure
 
-    name, title = "comparison", f"{result['plant']}, seed {result['seed']}, 95 % CI"
+    usual = f"{result['plant']}, seed {result['seed']}, 95 % CI"
+    name, asked = "comparison", dataclasses.replace(asked, title=asked.titled(usual))
     if "stress" in result:
-        name, drawn = "stress", stress_figure(result["stress"], title=title)
+        name, drawn = "stress", stress_figure(result["stress"], asked)
     else:
         drawn = comparison_figure(
             result["methods"],
             acceptable_score=result["acceptable_score"],
             step_s=plant(settings.plant).step_s,
-            title=title,
+            asked=asked,
         )
     paths = [save(drawn, directory / f"{name}.{kind}") for kind in ("png", "svg", "pdf")]
     screen.say(f"written: {', '.join(map(str, paths))}")

@@ -17,7 +17,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefi
 from hjepa_cli import __version__
 from hjepa_cli.core.plants.named import plant, plant_in
 from hjepa_cli.errors import MissingInputError, UsageError, shell
-from hjepa_cli.output.screen import Screen, described_steps, in_order, percent, span, tolerance
+from hjepa_cli.output.looks import Looks
+from hjepa_cli.output.page import explained, gain_rows, headline, methods_of, parts
+from hjepa_cli.output.screen import Screen, described_steps, in_order, span, tolerance
 from hjepa_cli.output.tables import (
     offline_columns,
     offline_rows,
@@ -35,6 +37,8 @@ STAGES = (
     *("train-encoder", "train-hierarchy", "train-reflex", "train-fusion"),
     *("eval", "scale", "survive", "bench-link"),
 )
+PARTS = ("runs", "sections", "note", "headline", "film", "wants_film")  # of the page
+FILM_LIMIT_BYTES = 64 * 2**20
 MACHINE = ("system", "machine", "cpus")  # of what a run remembers of its machine
 NO_RESULT = "preset smoke shows that all of it runs; too small to learn, its numbers mean nothing"
 
@@ -46,6 +50,10 @@ def run(
     out: Path = Path("report.html"),
     figures: Path | None = None,
     formats: Sequence[str] = ("pdf",),
+    film: Path | None = None,
+    title: str | None = None,
+    labels: Sequence[str] | None = None,
+    log: bool | None = None,
 ) -> Result:
     """Write the report; return the document of ``--json``.
 
@@ -54,30 +62,46 @@ def run(
         paths: run directories, or directories that hold some; none: the newest of each stage.
         out: the HTML file.
         figures, formats: a directory to write every figure into as well, and how.
+        film: a GIF of ``hjepa view`` to show.
+        title, labels, log: of the figures, as :meth:`hjepa_cli.output.looks.Looks.of`.
 
-    Raise MissingInputError without a finished run, and DataError for a damaged one.
+    Raise MissingInputError without a finished run or the film, UsageError for a film that is no
+    GIF, and DataError for a damaged run.
     """
+    asked, shown = Looks.of(title, labels, log), None if film is None else read_film(film)
     directories = found_runs(paths)
     template = page_template()
-    section = template.make_module(dict.fromkeys(("runs", "sections", "note"), ())).section
+    section = template.make_module(dict.fromkeys(PARTS, ())).section
     described, sections, written, names = [], [], [], figure_names(directories)
     for directory in directories:
         one = describe(directory)
         try:
-            drawn = draw(one, directory, screen)
+            one["lacking"] = lacking(one, directory)
+            drawn = draw(one, directory, screen, asked.wide())
             one["figures"] = [(text, _svg(figure)) for text, figure in drawn.values()]
             sections.append(section(one))
+            if figures is not None:  # those in files are as wide as a paper's column
+                drawn = draw(one, directory, screen, asked)
         except (UndefinedError, LookupError, TypeError, ValueError, ArithmeticError) as error:
             missing = str(error).rpartition("has no attribute ")[2]
             raise results.damaged(directory, one["stage"], missing) from None
         except UsageError as error:  # of a plant that no plugin in force adds
             raise results.damaged(directory, one["stage"], error) from None
+        for text in one["lacking"]:
+            screen.say(text)
         described.append(one)
         if figures is not None:
             name = names[directory]
             written += write_figures(drawn, figures, name, formats)
     note = NO_RESULT if any(one["preset"] == runs.SMOKE for one in described) else ""
-    text = template.render(runs=described, sections=sections, note=note)
+    text = template.render(
+        runs=described,
+        sections=sections,
+        note=note,
+        headline=headline(described),
+        film=shown,
+        wants_film=any(one["stage"] in ("eval", "scale") for one in described),
+    )
     files.write_text(files.target(out), text)
     if figures is not None:
         screen.say(f"{len(written)} figures in {figures}")
@@ -86,7 +110,7 @@ def run(
 
 
 def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") -> list[Path]:
-    """Return the finished runs among and below ``paths``, in reverse order of the pipeline.
+    """Return the finished runs among and below ``paths``, in the order of the pipeline.
 
     Without paths they are the newest of each stage. Raise MissingInputError, suggesting the
     commands ``made_by``, where there is none.
@@ -111,7 +135,7 @@ def found_runs(paths: Sequence[Path], made_by: str = "hjepa eval, hjepa scale") 
         raise MissingInputError(
             f"{', '.join(map(str, found))}: no run of {', '.join(STAGES)}", hint="hjepa eval"
         )
-    return sorted(known, key=lambda directory: -STAGES.index(stage_of(directory)))
+    return sorted(known, key=lambda directory: STAGES.index(stage_of(directory)))
 
 
 def page_template() -> Template:
@@ -119,6 +143,7 @@ def page_template() -> Template:
     environment = Environment(
         loader=PackageLoader("hjepa_cli", "output"),
         autoescape=True,
+        extensions=["jinja2.ext.do"],
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -129,12 +154,11 @@ def page_template() -> Template:
             row["devices"], row["devices_ci95"], 0, "≥" if row["at_least"] else ""
         ),
         "fixed": lambda value, decimals: None if value is None else f"{value:.{decimals}f}",
-        "percent": percent,
         "sprintf": lambda value, text: text % value,
     }
-    named = (gates, in_order, ranked, span, tolerance, windows)
+    named = (gates, in_order, ranked, span, tolerance, windows, explained, gain_rows, methods_of)
     tables = (offline_columns, offline_rows, stress_columns, stress_rows)
-    environment.globals |= {one.__name__: one for one in (*named, *tables)}
+    environment.globals |= {one.__name__: one for one in (*named, *tables, parts)}
     environment.globals["version"] = __version__
     return environment.get_template("report.html.j2")
 
@@ -166,10 +190,41 @@ def stage_of(directory: Path) -> str:
     return str(runs.read_environment(directory)["stage"])
 
 
-def draw(described: Mapping[str, Any], directory: Path, screen: Screen) -> Figures:
+def read_film(path: Path) -> str:
+    """Return a GIF as the page holds it. Raises MissingInputError, UsageError and DataError."""
+    try:
+        content = files.read_bytes(path, limit=FILM_LIMIT_BYTES)
+    except MissingInputError as error:
+        raise MissingInputError(error.message, hint=f"hjepa view --out {path}") from None
+    if not content.startswith((b"GIF87a", b"GIF89a")):
+        raise UsageError(f"--film {path}: not a GIF", hint="hjepa view --out film.gif")
+    return base64.b64encode(content).decode()
+
+
+def lacking(described: Mapping[str, Any], directory: Path) -> list[str]:
+    """Say which figures a run has not enough for, and which command makes it."""
+    stage, result, again = described["stage"], described["result"], described["again"]
+    if stage.startswith("train-") and not (directory / runs.METRICS).is_file():
+        return [f"No figure of the training, without {runs.METRICS}. To train again: {again}"]
+    if stage == "eval" and not has_intervals(result):
+        remeasured = "" if result.get("offline") else " --remeasure"
+        return [
+            "No figure of errors, whose intervals were not measured then. To measure again: "
+            f"{again}{remeasured}"
+        ]
+    return []
+
+
+def has_intervals(result: Result) -> bool:
+    """Return whether errors by windows have intervals, which older versions did not measure."""
+    return all("nmae_windows_ci95" in entry for entry in result["methods"].values())
+
+
+def draw(described: Mapping[str, Any], directory: Path, screen: Screen, asked: Looks) -> Figures:
     """Return the figures of a run, or none without matplotlib."""
     try:
-        return FIGURES[described["stage"]](described["result"], described["config"], directory)
+        stage, result = described["stage"], described["result"]
+        return FIGURES[stage](result, described["config"], directory, asked)
     except ModuleNotFoundError as missing:
         if not (missing.name or "").startswith("matplotlib"):
             raise
@@ -230,7 +285,7 @@ def ranked(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Mapping[st
     return sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
 
 
-def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+def training_figures(result: Result, config: Mapping[str, Any], run: Path, asked: Looks) -> Figures:
     """Draw losses and health over training."""
     path = run / runs.METRICS
     if not path.is_file():
@@ -241,56 +296,63 @@ def training_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: 
     rows = list(csv.DictReader(io.StringIO(text)))
     if len({row["step"] for row in rows}) < 2:
         return {}
-    return {"training": ("Training", figures.training_figure(rows))}
+    return {"training": ("Training", figures.training_figure(rows, asked))}
 
 
-def eval_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+def eval_figures(result: Result, config: Mapping[str, Any], run: Path, asked: Looks) -> Figures:
     """Draw score against gap and delivery, error against the horizon; none that would be empty."""
     from hjepa_cli.output import figures
 
     if "stress" in result:
         caption = "Score ÷ nominal score against the severity of each condition, 95 % bands"
-        return {"stress": (caption, figures.stress_figure(result["stress"]))}
+        return {"stress": (caption, figures.stress_figure(result["stress"], asked))}
     entries = in_order(result["methods"], config["methods"])
     if result.get("offline"):
-        text = "Error of the predicted force after a single packet, on recordings, 95 % bands"
-        return {"error": (text, figures.error_figure(entries, step_s=result["step_s"]))}
+        if not has_intervals(result):
+            return {}
+        text = "Mean error of the predicted force after a single packet, on recordings, 95 % bars"
+        return {
+            "error": (text, figures.error_figure(entries, step_s=result["step_s"], asked=asked))
+        }
     step_s = plant(result["plant"]).step_s
     acceptable = config["protocol"]["acceptable_score"]
     drawn = {
         kind: (
             f"Normalised score against the {against}, 95 % bands",
-            figures.score_figure(entries, kind, acceptable_score=acceptable, step_s=step_s),
+            figures.score_figure(
+                entries, kind, acceptable_score=acceptable, step_s=step_s, asked=asked
+            ),
         )
         for kind, against in (("gap", "time between packets"), ("delivery", "delivery probability"))
     }
-    text = "Error of the predicted force after a single packet, 95 % bands"
-    drawn["error"] = text, figures.error_figure(entries, step_s=step_s)
+    text = "Mean error of the predicted force after a single packet, 95 % bars"
+    if has_intervals(result):
+        drawn["error"] = text, figures.error_figure(entries, step_s=step_s, asked=asked)
     return {name: one for name, one in drawn.items() if figures.has_curves(one[1])}
 
 
-def scale_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+def scale_figures(result: Result, config: Mapping[str, Any], run: Path, asked: Looks) -> Figures:
     """Draw devices against the SNR."""
     from hjepa_cli.output import figures
 
     caption = f"Supported devices, law {result['law']}, 95 % intervals"
-    return {"devices": (caption, figures.scale_figure(result))}
+    return {"devices": (caption, figures.scale_figure(result, asked))}
 
 
-def survival_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+def survival_figures(result: Result, config: Mapping[str, Any], run: Path, asked: Looks) -> Figures:
     """Draw the share of loops that a gap loses."""
     from hjepa_cli.output import figures
 
     caption = "Loops lost in a single gap between packets, 95 % Clopper-Pearson intervals"
-    return {"survival": (caption, figures.survival_figure(result))}
+    return {"survival": (caption, figures.survival_figure(result, asked))}
 
 
-def wire_figures(result: Mapping[str, Any], config: Mapping[str, Any], run: Path) -> Figures:
+def wire_figures(result: Result, config: Mapping[str, Any], run: Path, asked: Looks) -> Figures:
     """Draw how late answers came and where forces came from."""
     from hjepa_cli.output import figures
 
     caption = "Control steps from a picture to the first force that answers it; who drove"
-    return {"wire": (caption, figures.wire_figure(result))}
+    return {"wire": (caption, figures.wire_figure(result, asked))}
 
 
 FIGURES: dict[str, Callable[..., Figures]] = {

@@ -6,6 +6,7 @@ radio and scheduler are simulated together.
 """
 
 import csv
+import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from hjepa_cli.core.radio.doppler import check_speed
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.errors import UsageError
+from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import ALLOCATION, show_allocations
 from hjepa_cli.plugins import LAWS
@@ -50,6 +52,9 @@ def run(
     verify: bool = False,
     further: Sequence[Path] | None = None,
     tolerance_steps: float | None = None,
+    title: str | None = None,
+    labels: Sequence[str] | None = None,
+    log: bool | None = None,
 ) -> dict[str, Any]:
     """Count devices; return the document of ``--json``.
 
@@ -65,6 +70,8 @@ def run(
         further: models of methods that the first one does not hold; ``None`` looks for them.
         tolerance_steps: count devices whose packets may come so many steps apart, and measure
             nothing: where there is no closed loop.
+        title, labels, log: of the figure, as :meth:`hjepa_cli.output.looks.Looks.of`; a finished
+            run's is drawn again.
 
     Raises:
         UsageError: bad SNR grid or method, or radio values that the law does not read.
@@ -73,7 +80,7 @@ def run(
         NumericalError: ``verify`` does not confirm what was found.
     """
     radio, kind = settings.radio, plant_of(settings)
-    grid_db = parse_snr(radio.snr_db)
+    grid_db, asked = parse_snr(radio.snr_db), Looks.of(title, labels, log)
     check_cell(radio, {"remeasure": remeasure}, settings.nr)
     count = counting(settings, screen, checkpoint, dataset, further, tolerance_steps)
     given: dict[str, Any] = {"verify": verify}
@@ -104,9 +111,11 @@ def run(
             }
             result["gains"] = count.gains(result["rows"], at_db)
             result["csv"] = write_csv(record.path("devices.csv"), result["rows"], count.columns)
-            result["figures"] = draw(result, record.directory, screen)
+            result["figures"] = draw(result, asked, record.directory, screen)
             result = record.finish(result)
         with results.showing("scale", recorded, record.directory):
+            if recorded is not None and asked != Looks():
+                result["figures"] = draw(result, asked, record.directory, screen)
             count.show(result)
             show_allocations(result["rows"], screen)
             screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
@@ -124,8 +133,10 @@ def plan(
     verify: bool = False,
     further: Sequence[Path] | None = None,
     tolerance_steps: float | None = None,
+    labels: Sequence[str] | None = None,
 ) -> Plan:
     """Plan a count of devices; arguments as of :func:`run`."""
+    Looks.of(labels=labels)
     radio, protocol = settings.radio, settings.protocol
     grid_db = parse_snr(radio.snr_db)
     check_cell(radio, {"remeasure": remeasure}, settings.nr)
@@ -220,8 +231,8 @@ def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> Path:
     return path
 
 
-def draw(result: Mapping[str, Any], directory: Path, screen: Screen) -> list[Path]:
-    """Write ``devices.png`` and ``devices.svg``; without matplotlib say how to get them."""
+def draw(result: Mapping[str, Any], asked: Looks, directory: Path, screen: Screen) -> list[Path]:
+    """Write ``devices`` as PNG, SVG and PDF; without matplotlib say how to get them."""
     try:
         from hjepa_cli.output import figures
     except ModuleNotFoundError as missing:
@@ -229,6 +240,6 @@ def draw(result: Mapping[str, Any], directory: Path, screen: Screen) -> list[Pat
             raise
         screen.say('no figure without matplotlib: pip install "hjepa[plot]"')
         return []
-    title = f"{described(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI"
-    figure = figures.scale_figure(result, title=title)
-    return [figures.save(figure, directory / f"devices.{kind}") for kind in ("png", "svg")]
+    usual = f"{described(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI"
+    figure = figures.scale_figure(result, dataclasses.replace(asked, title=asked.titled(usual)))
+    return [figures.save(figure, directory / f"devices.{kind}") for kind in figures.METADATA]

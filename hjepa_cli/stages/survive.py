@@ -29,6 +29,7 @@ from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.duty import duty_devices
 from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.screen import Screen, span, ticking
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import results
@@ -450,7 +451,7 @@ def draw(result: Mapping[str, Any], directory: Path, screen: Screen) -> list[Pat
         screen.say('no figure without matplotlib: pip install "hjepa[plot]"')
         return []
     title = f"{result['plant']}, {result['n_loops']} loops, 95 % CI"
-    figure = figures.survival_figure(result, title=title)
+    figure = figures.survival_figure(result, Looks(title=title))
     return [figures.save(figure, directory / f"survival.{kind}") for kind in ("png", "svg")]
 
 

@@ -185,7 +185,8 @@ def check(
     animation.check_target(out, fps, devices, len(settings.methods))
     steps = settings.protocol.total_steps
     pictures = steps // every if every else 100
-    size = math.prod(animation.size_px(devices, len(settings.methods)))
+    laid = animation.grid(devices, len(settings.methods))
+    size = math.prod(laid.size_px if laid else animation.MOST_PX)
     memory.check(pictures * size, f"{pictures} pictures of {devices} devices")
 
 

@@ -113,7 +113,15 @@ def test_the_figure_has_every_method_and_its_band(shell):
     document = shell("compare", "--figures", "f", "--format", "svg", "--json").document
     assert document["figures"] == ["f/trainings.svg"]
     drawn = (shell.directory / "f" / "trainings.svg").read_text()
-    assert drawn.count("FillBetween") >= 5 or drawn.count("PolyCollection") >= 5  # 3 + 2 lines
+    assert drawn.count("FillBetween") == 3 or drawn.count("PolyCollection") == 3  # of scores
+    for name in document["methods"]:
+        assert f"<!-- {name} -->" in drawn or f"<!-- ≈ {name} -->" in drawn, name
+    title = ("--title", "five of them", "--labels", "hjepa=H-JEPA")
+    shell("compare", "--figures", "f", "--format", "svg", *title)
+    drawn = (shell.directory / "f" / "trainings.svg").read_text()
+    assert "<!-- five of them -->" in drawn and "<!-- H-JEPA -->" in drawn
+    with shell.untouched():
+        assert_one_line_error(shell("compare", *title), 2, "none is drawn", "--figures")
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,13 @@ import pytest
 
 from hjepa_cli import plugins
 from hjepa_cli.errors import UsageError
+from hjepa_cli.output.looks import Looks
 from hjepa_cli.plugins import SCHEDULERS
 
 matplotlib = pytest.importorskip("matplotlib")
-from hjepa_cli.output import figures  # noqa: E402 - needs matplotlib
+from matplotlib.text import Text  # noqa: E402 - an annotation's own extent has its line in it
+
+from hjepa_cli.output import figures, lettering  # noqa: E402 - needs matplotlib
 
 METHODS = ("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero", "hold-true", "zero-true", "oracle")
 
@@ -130,29 +133,39 @@ def test_rows_in_any_order_give_the_same_lines():
     assert list(backwards["hjepa"].get_xdata()) == [10, 15, 20]
 
 
-def test_methods_a_decade_apart_are_logarithmic_and_close_ones_start_at_zero():
-    close = rows(METHODS[:3], snr_db=(1.0, 20.0))  # a decade apart by SNR only
-    assert figures.devices_figure(close).axes[0].get_yscale() == "linear"
-    assert figures.devices_figure(close).axes[0].get_ylim()[0] == 0
+def test_axes_are_linear_from_zero_unless_a_logarithm_is_asked_for():
     far = rows(METHODS[:2], snr_db=(20.0,)) + rows(["oracle"], snr_db=(20.0,), scale=2000.0)
-    assert figures.devices_figure(far).axes[0].get_yscale() == "log"
+    assert figures.devices_figure(far).axes[0].get_yscale() == "linear"
+    assert figures.devices_figure(far).axes[0].get_ylim()[0] == 0
+    assert figures.devices_figure(far, Looks(log=True)).axes[0].get_yscale() == "log"
 
 
 def test_nothing_is_cut_off():
     for data in (rows(), rows(scale=1e4)[:8] + rows()[8:], rows(spread=0.9)):
-        axes = figures.devices_figure(data).axes[0]
-        low, high = axes.get_ylim()
-        counts = [row["devices"] for row in data]
-        assert low < min(counts) and high > max(counts)
+        for log in (False, True):
+            axes = figures.devices_figure(data, Looks(log=log)).axes[0]
+            low, high = axes.get_ylim()
+            counts = [row["devices"] for row in data]
+            assert low < min(counts) and high > max(counts)
 
 
 def test_methods_without_devices_are_named_and_methods_without_counts_left_out():
     data = rows(["hjepa"])
     data += [row | {"method": "zero", "devices": 0, "devices_ci95": [0, 0]} for row in data]
     data += [row | {"method": "optimal", "devices": None, "devices_ci95": None} for row in data[:3]]
-    drawn = lines(figures.devices_figure(data))
-    assert set(drawn) == {"hjepa", "zero (0)"}
-    assert np.isnan(drawn["zero (0)"].get_ydata()).all()
+    figure = figures.devices_figure(data)
+    assert set(lines(figure)) == {"hjepa"}
+    assert [legend.get_title().get_text() for legend in figure.legends] == ["no devices: zero"]
+
+
+def test_a_count_of_nobody_is_drawn_where_an_axis_has_a_zero():
+    data = rows(["hjepa"])
+    data[0] |= {"devices": 0, "devices_ci95": [0, 0]}
+    linear, log = (
+        lines(figures.devices_figure(data, Looks(log=log)))["hjepa"].get_ydata()
+        for log in (False, True)
+    )
+    assert linear[0] == 0 and np.isnan(log[0])
 
 
 def test_one_snr_shows_its_interval_as_a_bar():
@@ -197,7 +210,7 @@ def scheduled_rows(methods=("hjepa", "hold"), snr_db=(10.0, 20.0, 30.0)):
 @pytest.mark.parametrize("snr_db", [(10.0, 20.0, 30.0), (20.0,)])
 def test_every_scheduler_is_a_line_in_its_method_s_panel(snr_db):
     result = {"law": "scheduled", "rows": scheduled_rows(snr_db=snr_db)}
-    figure = figures.scale_figure(result, title="a cell")
+    figure = figures.scale_figure(result, Looks(title="a cell"))
     assert len(figure.axes) == 2 and figure.axes[0].get_title() == "a cell"
     for axes in figure.axes:
         drawn = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
@@ -214,3 +227,120 @@ def test_schedulers_differ_without_colour():
     styles = [SCHEDULERS[name].style for name in SCHEDULERS]
     looks = {(style.marker, str(style.line), style.hollow) for style in styles}
     assert len(looks) == len(styles)
+
+
+# --- letters
+
+
+def names(figure):
+    """The names at the ends of lines, the highest first."""
+    return sorted(figure.axes[0].texts, key=lambda text: -text.get_position()[1])
+
+
+def test_lines_are_named_at_their_ends_in_their_colour_and_from_the_highest_down():
+    figure = figures.devices_figure(rows(), Looks(labels={"hjepa": "H-JEPA"}))
+    drawn = lines(figure)
+    told = {text.get_text(): text for text in names(figure)}
+    assert list(told) == [*METHODS[:0:-1], "H-JEPA"]
+    for name, text in told.items():
+        assert text.get_color() == drawn[name].get_color()
+        assert text.xy == (20, drawn[name].get_ydata()[-1])
+
+
+def test_lines_on_each_other_are_said_to_be():
+    """A twentieth apart can be seen, a hundredth cannot."""
+    data = rows(["hjepa"])
+    scaled = lambda name, by: [  # noqa: E731
+        row | {"method": name, "devices": by * row["devices"]} for row in rows(["hjepa"])
+    ]
+    figure = figures.devices_figure([*data, *scaled("hold", 0.99), *scaled("zero", 0.9)])
+    assert [text.get_text() for text in names(figure)] == ["hjepa", "≈ hold", "zero"]
+    assert [legend.get_title().get_text() for legend in figure.legends] == [lettering.LIES_ON]
+    apart = figures.devices_figure([*data, *scaled("zero", 0.9)])
+    assert not apart.legends
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ([0.8, 0.5, 0.2], [0.8, 0.5, 0.2]),
+        ([0.5, 0.5], [0.55, 0.45]),
+        ([0.5, 0.5, 0.46], [0.5867, 0.4867, 0.3867]),  # mean of 0.5, 0.6 and 0.66, less 0, 1, 2
+        ([1.0, 1.0], [0.95, 0.85]),
+        ([0.0, 0.0], [0.15, 0.05]),
+        ([], []),
+    ],
+)
+def test_names_are_spread_by_the_least_moves(wanted, expected):
+    assert lettering.spread(wanted, 0.1) == pytest.approx(expected, abs=1e-3)
+
+
+def overlapping(figure):
+    """Pairs of texts of an axis, or of names at lines, that are drawn on each other."""
+    figure.draw_without_rendering()
+    found = []
+    for axes in figure.axes:
+        low, high = sorted(axes.get_xlim())
+        groups = [axes.texts]
+        for axis, ends in (
+            (axes.xaxis, sorted(axes.get_xlim())),
+            (axes.yaxis, sorted(axes.get_ylim())),
+        ):
+            low, high = ends
+            shown = [
+                tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high
+            ]
+            groups.append([label for label in shown if label.get_visible() and label.get_text()])
+            texts = [label.get_text() for label in groups[-1]]
+            assert len(set(texts)) == len(texts), texts  # none twice
+        for group in groups:
+            boxes = [(text.get_text(), Text.get_window_extent(text)) for text in group]
+            found += [
+                (one, other)
+                for number, (one, box) in enumerate(boxes)
+                for other, another in boxes[number + 1 :]
+                if box.shrunk(0.98, 0.8).overlaps(another.shrunk(0.98, 0.8))
+            ]
+    return found
+
+
+@pytest.mark.parametrize("looks", [Looks(), Looks(log=True), Looks().wide()])
+@pytest.mark.parametrize(
+    "data",
+    [
+        rows(),
+        rows(scale=0.01),  # counts of a few
+        rows(scale=1e4),
+        rows(snr_db=(10.0, 10.25, 10.5, 20.0)),
+        rows(snr_db=tuple(map(float, range(10, 31)))),
+        rows(METHODS[:2]) + rows(["oracle"], scale=1e4),
+        rows(spread=0.0, scale=1.0)[:1],
+    ],
+)
+def test_letters_never_collide_or_repeat(data, looks):
+    assert not overlapping(figures.devices_figure(data, looks))
+
+
+@pytest.mark.parametrize("log", [None, False, True])
+def test_letters_of_scores_and_errors_never_collide_or_repeat(log):
+    entries = {
+        name: {
+            "nmae": [0.1],
+            "nmae_windows": {"1-20": 2e-4 * 9**rank, "81-100": 0.03 / (rank + 1)},
+            "nmae_windows_ci95": {"1-20": [1e-4, 0.9], "81-100": [0.001, 0.2]},
+            "tolerance_gap_steps": 80.0,
+            "gap_curve": [
+                {"d": d, "score": 1 / d, "ci95": [0.9 / d, 1.1 / d]} for d in (1, 20, 320)
+            ],
+            "delivery_curve": [
+                {"p": 1 / d, "score": 1 / d, "ci95": [0.9 / d, 1.1 / d]} for d in (1, 20, 320)
+            ],
+        }
+        for rank, name in enumerate(METHODS[:4])
+    }  # fmt: skip
+    looks = Looks(log=log)
+    for kind in ("gap", "delivery"):
+        assert not overlapping(
+            figures.score_figure(entries, kind, acceptable_score=0.62, step_s=1e-3, asked=looks)
+        )
+    assert not overlapping(figures.error_figure(entries, step_s=20e-3, asked=looks))

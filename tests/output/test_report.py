@@ -11,6 +11,9 @@ import pytest
 from command_line import assert_one_line_error, open_shell
 
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.output import looks, page
+from hjepa_cli.output.looks import COLUMN_IN, PAGE_IN
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import report
 from hjepa_cli.storage import runs
 from hjepa_cli.storage.runs import Run
@@ -53,6 +56,7 @@ def entry(score):
         "nmae": [0.01, 0.02, 0.03],
         "nmae_ci95": [[0.009, 0.011], [0.019, 0.021], [0.029, 0.031]],
         "nmae_windows": {"1-20": 0.025},
+        "nmae_windows_ci95": {"1-20": [0.02, 0.03]},
         "score": score,
         "score_ci95": [score - 0.1, score + 0.1],
         "lq_ratio": 0.8,
@@ -138,7 +142,7 @@ def test_a_report_is_self_contained_and_well_formed(shell):
     scaled(), evaluated(), trained()
     document = shell("report", "--json").document
     assert document["report"] == "report.html"
-    assert document["runs"] == ["runs/scale/0001", "runs/eval/0001", "runs/train-encoder/0001"]
+    assert document["runs"] == ["runs/train-encoder/0001", "runs/eval/0001", "runs/scale/0001"]
     text = Path("report.html").read_text()
     page = Reader(text)
     assert "script" not in page.tags and "link" not in page.tags and "iframe" not in page.tags
@@ -155,7 +159,7 @@ def test_a_report_shows_numbers_intervals_settings_and_commands(shell, without_f
     said = " ".join(Reader(Path("report.html").read_text()).texts)
     for text in (
         *("1110 (1110 – 1117)", "≥ 500 (500 – 507)", "12,346"),
-        "+122.0 % (+100.0 % to unbounded) devices",
+        "hjepa hold 20 +122.0 % +100.0 % to unbounded",
         "hjepa eval --config runs/eval/0001/config.toml",
         *("effective_rank 3 ≥ 4 FAILED", "actor_nrmse 0.2 ≤ 0.35 passed"),
         *("0.950 (0.850 – 1.050)", "81.2 (75.0 – 90.5)", "≤ 0.0125 (0.0100 – 0.0200)"),
@@ -244,7 +248,7 @@ def test_every_stage_escapes_what_it_shows(shell, without_figures):
     finished("eval", {"plant": EVIL, "seed": 0, "methods": {EVIL: entry(0.9)}, **others})
     shell("report")
     text = Path("report.html").read_text()
-    assert "<script" not in text and "".join(Reader(text).texts).count(EVIL) == 16
+    assert "<script" not in text and "".join(Reader(text).texts).count(EVIL) == 17
     assert f"Of other models: {EVIL}: c; a: {EVIL}." in "".join(Reader(text).texts)
 
 
@@ -303,6 +307,7 @@ def test_score_figure_draws_each_curve_with_its_band():
     )
     (axes,) = figure.axes
     lines = {line.get_label(): line for line in axes.lines}
+    assert axes.get_xscale() == "linear"
     np.testing.assert_allclose(lines["hjepa"].get_xdata(), [1, 2, 8])
     np.testing.assert_allclose(lines["hold"].get_ydata(), [0.6, 0.3, 0.075])
     corners = axes.collections[0].get_paths()[0].vertices
@@ -317,9 +322,22 @@ def test_score_figure_draws_each_curve_with_its_band():
 def test_error_figure_leaves_out_who_makes_no_error():
     exact = entry(1.0) | {"nmae": [1e-8] * 3, "nmae_ci95": [[0, 1e-8]] * 3}
     figure = figures.error_figure({"hjepa": entry(0.9), "oracle": exact}, step_s=20e-3)
-    (line,) = figure.axes[0].lines
-    assert line.get_label() == "hjepa" and list(line.get_xdata()) == [0, 20, 40]
-    assert figure.axes[0].get_ylim()[0] > 1e-3
+    (axes,) = figure.axes
+    ((line, _, (interval,)),) = axes.containers
+    assert axes.containers[0].get_label() == "hjepa" and list(line.get_ydata()) == [0.025]
+    assert interval.get_segments()[0][:, 1] == pytest.approx([0.02, 0.03])
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["20–400"]
+    assert [legend.get_title().get_text() for legend in figure.legends] == ["no error: oracle"]
+
+
+def test_windows_that_the_horizon_does_not_reach_are_left_out():
+    short = entry(0.9)
+    short["nmae_windows"] |= {"21-40": None}
+    short["nmae_windows_ci95"] |= {"21-40": None}
+    figure = figures.error_figure({"hjepa": short}, step_s=1e-3)
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["1–20"]
+    none = short | {"nmae_windows": {"1-20": None}}
+    assert not figures.has_curves(figures.error_figure({"hjepa": none}, step_s=1e-3))
 
 
 def test_a_report_of_those_who_make_no_error_has_no_empty_figure(shell):
@@ -425,3 +443,138 @@ def test_a_damaged_run_over_the_wire_is_refused(shell, change):
 def test_runs_that_no_report_shows_are_refused(shell):
     made = finished("collect", {"dataset": "d"})
     assert_one_line_error(shell("report", made), 66, "no run of train-encoder")
+
+
+# --- the page
+
+
+def test_the_result_comes_first_and_stages_in_their_order(shell, without_figures):
+    scaled(), evaluated(), trained()
+    shell("report")
+    text = Path("report.html").read_text()
+    told = text.index('class="headline"')
+    assert "supports 2220 (2220 – 2227) devices with hjepa at 20 dB; 1000 with hold." in text
+    places = [text.index(f"<h2>{stage}: ") for stage in ("train-encoder", "eval", "scale")]
+    assert [told, *places] == sorted([told, *places])
+    shell("report", "runs/eval")
+    text = Path("report.html").read_text()
+    assert "hjepa tolerates gaps of 81.2 (75.0 – 90.5) steps between packets" in text
+    shell("report", "runs/train-encoder")
+    assert 'class="headline"' not in Path("report.html").read_text()
+
+
+def test_methods_are_explained(shell, without_figures):
+    evaluated()
+    shell("report")
+    said = " ".join(" ".join(row) for row in rows_of(Path("report.html").read_text()))
+    assert "hjepa predicts the embedding in three strides" in said
+
+
+def test_every_method_of_the_package_is_explained():
+    unexplained = [name for name in METHODS if not page.explained(name)]
+    assert not unexplained
+    assert not any("plugin" in page.explained(name) for name in METHODS)
+    assert page.explained("ts-jepa-12").endswith("12 steps at a time")
+    assert page.explained("supervised-2+6") == page.explained("supervised-2")
+
+
+def test_wide_tables_are_split_and_repeat_their_first_column():
+    """20 columns in three parts of at most 9; whatever is empty is left out."""
+    columns = ["method", *map(str, range(20))]
+    row = ["hjepa", *range(20)]
+    found = page.parts(columns, [row, ["none", *[None] * 20], ["half", *range(10), *[None] * 10]])
+    assert [len(part.columns) for part in found] == [8, 8, 7]
+    for part in found:
+        assert part.columns[0] == ("method", True)
+        assert part.rows[0][0] == ("hjepa", True)
+        assert "none" not in [cells[0][0] for cells in part.rows]
+    numbers = [name for part in found for name, _ in part.columns[1:]]
+    assert numbers == columns[1:]
+    assert [len(part.rows) for part in found] == [2, 2, 1]
+    assert page.parts(columns, []) == []
+
+
+def test_nothing_of_a_page_is_cut_on_paper_and_no_row_is_empty(shell):
+    """Tables have at most nine columns and may wrap in print; figures are as wide as the page."""
+    rows = [f"{snr}" for snr in range(10, 31)]
+    assert len(rows) > page.MOST_COLUMNS
+    scaled(), evaluated(), trained()
+    shell("report")
+    text = Path("report.html").read_text()
+    for table in re.findall(r"<table>.*?</table>", text, re.DOTALL):
+        for row in re.findall(r"<tr>(.*?)</tr>", table, re.DOTALL):
+            cells = re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row)
+            assert 1 < len(cells) <= page.MOST_COLUMNS + 1
+        for row in re.findall(r"<tr>(<td.*?)</tr>", table, re.DOTALL):
+            assert any(re.findall(r"<td[^>]*>(.*?)</td>", row)[1:]), row
+    style = text[text.index("<style>") : text.index("</style>")]
+    printed = style[style.index("@media print") :]
+    assert "landscape" in style and "overflow: visible" in printed
+    assert "white-space: normal" in printed
+    assert "figure img { width: 100%;" in style and "27rem" not in style
+    for picture in re.findall(r"svg\+xml;base64,([^\"]*)", text):
+        svg = ElementTree.fromstring(base64.b64decode(picture))
+        assert float(svg.get("width").removesuffix("pt")) == pytest.approx(72 * PAGE_IN)
+
+
+def test_files_are_as_wide_as_a_column_with_the_looks_that_were_asked_for(shell):
+    scaled()
+    asked = ("--title", "my cell", "--labels", "hjepa=H-JEPA, hold=last force", "--log")
+    shell("report", "--figures", "f", "--format", "svg", *asked)
+    svg = ElementTree.parse("f/scale-devices.svg").getroot()
+    assert float(svg.get("width").removesuffix("pt")) == pytest.approx(72 * COLUMN_IN)
+    text = Path("f/scale-devices.svg").read_text()
+    for said in ("my cell", "H-JEPA", "last force (at least)"):
+        assert f"<!-- {said} -->" in text, said
+    with shell.untouched():
+        wrong = shell("report", "--labels", "hjeap=x")
+        assert_one_line_error(wrong, 2, "no method or scheduler 'hjeap'", "hjepa")
+        assert_one_line_error(shell("report", "--labels", "hjepa"), 2, "NAME=TEXT")
+
+
+def test_a_film_is_shown_and_its_absence_told(shell, without_figures):
+    scaled()
+    shell("report")
+    assert "hjepa view --out film.gif" in Path("report.html").read_text()
+    film = b"GIF89a" + bytes(20)
+    Path("film.gif").write_bytes(film)
+    shell("report", "--film", "film.gif")
+    text = Path("report.html").read_text()
+    assert f"data:image/gif;base64,{base64.b64encode(film).decode()}" in text
+    assert "No film" not in text
+    with shell.untouched():
+        missing = shell("report", "--film", "other.gif")
+        assert_one_line_error(missing, 66, "other.gif", "hjepa view --out other.gif")
+        assert_one_line_error(shell("report", "--film", "report.html"), 2, "not a GIF", "view")
+
+
+def test_what_a_figure_lacks_is_told_with_the_command_that_makes_it(shell):
+    """Neither an empty figure nor a figure of half the methods."""
+    older = entry(0.5)
+    del older["nmae_windows_ci95"]
+    methods = {"hjepa": entry(0.95), "hold": older}
+    finished("eval", {"plant": "desktop", "seed": 0, "checkpoint": "m", "methods": methods})
+    finished("train-encoder", {"checkpoint": "c", "seconds": 3.0, "gates": {}})
+    outcome = shell("report")
+    assert outcome.code == 0 and not Path("runs/train-encoder/0001/metrics.csv").exists()
+    text = Path("report.html").read_text()
+    assert text.count("<img") == 2  # scores against gap and delivery
+    for command in (
+        "hjepa eval --config runs/eval/0001/config.toml --remeasure",
+        "hjepa train-encoder --config runs/train-encoder/0001/config.toml",
+    ):
+        assert command in outcome.err and f"again: {command}</p>" in text, command
+
+
+def test_a_wrong_label_is_refused_before_anything_is_planned(shell):
+    with shell.untouched():
+        for command in ("scale", "eval --figure", "compare --figures f"):
+            words = [*command.split(), "--labels", "hjeap=x"]
+            assert_one_line_error(shell(*words), 2, "no method or scheduler 'hjeap'")
+        assert_one_line_error(shell("scale", "--labels", "a=b", "--dry-run"), 2, "'a'")
+        assert_one_line_error(shell("eval", "--title", "x"), 2, "none is drawn", "--figure")
+
+
+def test_a_dollar_is_a_dollar():
+    assert looks.Looks.of(title="$1 and $2").titled("") == r"\$1 and \$2"
+    assert looks.Looks.of(labels=["hold=$"]).named("hold") == r"\$"

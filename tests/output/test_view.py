@@ -205,38 +205,77 @@ def test_the_strip_shows_every_slot_of_the_last_while():
     shots = pictures()
     k = 290
     panel = np.asarray(shots._panel(shots.films[0], 1, k))
-    row = panel[-4]  # above the ticks
-    for column in range(animation.PANEL_PX[0]):
-        slot = k - (animation.PANEL_PX[0] - 1 - column)
-        nearby = shots.link.delivered[slot : slot + 2, 1]  # a bar is two columns wide
+    row = panel[-8]  # above the ticks
+    width = shots.grid.panel_px[0]
+    for column in range(width):
+        slot = k - (width - 1 - column)
+        nearby = shots.link.delivered[
+            max(slot, 0) : max(slot + 2, 0), 1
+        ]  # a bar is two columns wide
         assert (tuple(row[column]) == animation.ARRIVED) == nearby.any(), column
 
 
-def test_the_belief_is_drawn_where_it_is():
-    """The dashed line ends at the believed tip, the red pole at the true one."""
-    shots = pictures()
-    panel = np.asarray(shots._panel(shots.films[0], 0, 0)).astype(int)[16 : 16 + 128]
-    scale = 2 * shots._camera.scale_px_m
-    pivot = np.array([128 + 0.02 * scale, 96])
-    dark = panel.sum(axis=-1) < 60  # black dashes
-    for angle, is_there in ((0.3, True), (-0.3, False)):
-        along = [
-            pivot + 0.2 * share * scale * np.array([np.sin(angle), -np.cos(angle)])
-            for share in np.linspace(0.5, 0.95, 40)
-        ]
-        hits = sum(dark[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2].any()
-                   for x, y in along)  # fmt: skip
-        assert (hits > 15) == is_there
+def tilt(scene):
+    """The angle [rad] of the pole in a scene, from where its colour lies in two of its rows."""
+    redness = np.asarray(scene).astype(float)
+    redness = np.clip(redness[..., 0] - redness[..., 2], 0, None)
+    rows = np.array([10, 30])
+    columns = (redness[rows] * np.arange(redness.shape[1])).sum(axis=1) / redness[rows].sum(axis=1)
+    return np.arctan((columns[0] - columns[1]) / (rows[1] - rows[0]))
 
 
-@pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 30), (40, 24), (200, 60)])
-def test_terminal_pictures_fit_the_terminal(width, height):
+def test_truth_and_belief_lie_beside_each_other_where_they_are():
+    """The true pole leans by 0.1 rad, the believed one by 0.3; the cart is in the middle."""
     shots = pictures()
+    true, believed = shots.scenes(shots.films[0], 0, 0)
+    assert tilt(true) == pytest.approx(0.1, abs=0.02)
+    assert tilt(believed) == pytest.approx(0.3, abs=0.02)
+    assert np.asarray(true).min() < 30 < 100 < np.asarray(believed).min()
+    row = 48 - animation.SKY_PX + 2  # of the cart
+    blue = 255 - np.asarray(true)[row, :, 0].astype(float)
+    middle = (blue * (np.arange(len(blue)) + 0.5)).sum() / blue.sum()
+    assert middle == pytest.approx(animation.VIEW_PX[0] / 2, abs=0.6)
+    panel = np.asarray(shots._panel(shots.films[0], 0, 0))
+    assert panel.shape[1] == 2 * animation.VIEW_PX[0] * shots.grid.scale + 2
+
+
+def test_poles_are_drawn_four_times_as_large_as_they_were():
+    """There were two pixels for one of the camera; what is out of its sight is called so."""
+    shots = pictures(devices=3)
+    assert shots.grid.scale == 8 and shots.size_px <= animation.MOST_PX
+    assert shots.in_sight(shots.films[0], 0, 0)
+    shots.films[0].states[5, 0, 0] = 3.0
+    assert not shots.in_sight(shots.films[0], 0, 5)
+    seen, _ = shots.scenes(shots.films[0], 0, 5)
+    assert len(np.unique(np.asarray(seen).reshape(-1, 3), axis=0)) == 1
+    shots.draw(5)
+
+
+@pytest.mark.parametrize(("devices", "methods"), [(1, 2), (2, 2), (5, 1), (12, 2), (24, 2)])
+def test_many_devices_are_tiled_into_a_picture_of_bounded_size(devices, methods):
+    laid = animation.grid(devices, methods)
+    assert laid.columns * laid.rows >= devices
+    assert all(size <= most for size, most in zip(laid.size_px, animation.MOST_PX, strict=True))
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 30), (60, 24), (200, 60)])
+@pytest.mark.parametrize("devices", [1, 3])
+def test_terminal_pictures_fit_the_terminal_and_can_be_made_out(width, height, devices):
+    """A pole is at least two thirds of the least scene: six lines of twelve pixels."""
+    shots = pictures(devices=devices)
     lines = rendered(shots, 50, width, height)
     assert max(map(len, lines)) <= width and len(lines) <= height - 1
     text = "\n".join(lines)
-    assert text.count("ms old") == 2 and "▀" in text and "hjepa, 50 ms" in text
-    assert text.count("theta off by +11.5°") == 2
+    shown = live.layout(devices, 1, width, height)
+    assert shown.rows >= live.LEAST_ROWS
+    assert text.count("ms old") == text.count("theta off by +11.5°") == shown.devices
+    assert "▀" in text and "50 ms" in text and "left true, right believed" in text
+    assert (f"{shown.devices} of {devices} devices fit here" in text) == (shown.devices < devices)
+
+
+def test_a_terminal_of_the_usual_size_shows_two_methods():
+    assert live.layout(3, 2, 80, 24).rows > live.LEAST_ROWS
+    assert live.layout(3, 2, 80, 24).devices == 1
 
 
 def rendered(shots, k, width, height):
@@ -251,19 +290,19 @@ def rendered(shots, k, width, height):
 def test_the_terminal_marks_what_arrived_and_what_was_lost():
     """A character per picture, the newest at the right."""
     shots = pictures(steps=300, devices=1, every=10)
-    (strip,) = (line for line in rendered(shots, 290, 80, 24) if line.strip("█· ") == "")
-    slots = shots.link.delivered[1:291, 0].reshape(29, 10).any(axis=1)
-    assert strip.lstrip()[1:] == "".join("█" if arrived else "·" for arrived in slots)
+    (strip,) = (line for line in rendered(shots, 290, 80, 24) if line and not line.strip("█· "))
+    slots = shots.link.delivered[:291, 0]
+    marks = ["█" if slots[max(end - 10, 0) : end].any() else "·" for end in range(1, 292, 10)]
+    assert strip.strip() == "".join(marks)[-len(strip.strip()) :]
 
 
-def test_the_terminal_shows_where_the_controller_believes_the_pole_to_be():
+def test_the_terminal_shows_what_the_controller_believes_beside_the_truth():
     shots = pictures(devices=1)
-    scene = live._scene(shots, shots.films[0], 0, 0, 64)
-    black = {span.start for span in scene.spans if "#000000" in str(span.style)}
-    columns = [start % 65 for start in black]  # a line is 64 characters and its end
-    pivot = 32 + 0.02 * 64 / 0.6
-    tip = pivot + np.sin(0.3) * 0.2 * 64 / 0.6  # believed at 0.3 rad, true at 0.1
-    assert min(columns) == pytest.approx(pivot, abs=1) and max(columns) == pytest.approx(tip, abs=1)
+    laid = live.layout(1, 1, 80, 24)
+    lines = live._scenes(shots, shots.films[0], 0, 0, laid).plain.splitlines()
+    assert len(lines) == laid.rows
+    for line in lines:
+        assert line == "▀" * laid.scene_columns + " " + "▀" * laid.scene_columns
 
 
 # --- the command
@@ -352,5 +391,7 @@ def test_what_cannot_be_viewed_is_refused(shell, checkpoint):
         assert_one_line_error(shell("view", "--out", "a.avi", *small), 2, ".avi", ".mp4")
         assert_one_line_error(shell("view", "--fps", "60", *small), 2, "--fps 60", "50", ".mp4")
         assert_one_line_error(shell("view", "--live", *small), 2, "terminal")
+        many = shell("view", "--devices", "100", *small)
+        assert_one_line_error(many, 2, "100 devices", "1920 × 1440", "--devices with at most 24")
         assert_one_line_error(shell("view", "--delivery", "0", *small), 2, "--delivery")
         assert_one_line_error(shell("view", "--snr", "nan", *small), 2, "--snr")

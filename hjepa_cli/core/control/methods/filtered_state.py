@@ -80,5 +80,5 @@ STATE_48 = Method(
     offered=_offered_to_four_states,
     trained_by=_training_of_four_states,
     fitted=True,
-    style=Style("#332288", "8", "-."),
+    style=Style("#8A7FD1", "8", "-."),
 )

@@ -52,5 +52,5 @@ LOCAL = Method(
     offered=of_hierarchy,
     trained_by=training("train-hierarchy"),
     needs_link=False,
-    style=Style("#000000", "s", ":", hollow=True, size=6.5),
+    style=Style("#595959", "s", ":", hollow=True, size=6.5),
 )

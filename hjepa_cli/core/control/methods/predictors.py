@@ -92,15 +92,15 @@ HJEPA_FUSED = predictor(
     fused=True,
     offered=lambda architecture, plant: bool(architecture.get("fusion")),
     trained_by=training("train-fusion"),
-    style=Style("#0072B2", "H", ":", size=7.0),
+    style=Style("#00366B", "H", ":", size=7.0),
 )
 
 _STYLES = {  # of the depths that the paper compares
     1: Style("#D55E00", "s", "--", size=2.8),
     2: Style("#56B4E9", "<", "--"),
-    3: Style("#56B4E9", ">", "-."),
+    3: Style("#6C8EBF", ">", "-."),
     4: Style("#009E73", "^", "-.", size=5.0),
-    5: Style("#56B4E9", "p", ":"),
+    5: Style("#5F7A8C", "p", ":"),
 }
 
 

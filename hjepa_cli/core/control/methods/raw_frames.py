@@ -51,5 +51,5 @@ def _method(kind: str, frames: int, style: Style) -> Method:
 
 
 SUPERVISED_2 = _method("supervised", 2, Style("#882255", "P", "--"))
-SUPERVISED_4 = _method("supervised", 4, Style("#882255", "X", "-."))
+SUPERVISED_4 = _method("supervised", 4, Style("#AA4466", "X", "-."))
 AUTOENCODER_2 = _method("autoencoder", 2, Style("#999933", "h", "--"))

@@ -57,9 +57,9 @@ def _method(
     )
 
 
-HOLD_DECAY = _method("hold-decay", _decaying, Style("#CC79A7", "^", "-.", hollow=True, size=5.0))
+HOLD_DECAY = _method("hold-decay", _decaying, Style("#9467BD", "^", "-.", hollow=True, size=5.0))
 HOLD_DECAY_LINEAR = _method(
-    "hold-decay-linear", _decaying, Style("#CC79A7", ">", "--", hollow=True, size=5.0)
+    "hold-decay-linear", _decaying, Style("#6A3D9A", ">", "--", hollow=True, size=5.0)
 )
 CHUNK = _method("chunk", _chunked, Style("#117733", "X", "--", hollow=True, size=5.0))
-CHUNK_FORCES = _method("chunk-forces", _chunked, Style("#117733", "P", "-.", hollow=True, size=5.0))
+CHUNK_FORCES = _method("chunk-forces", _chunked, Style("#66A61E", "P", "-.", hollow=True, size=5.0))

@@ -68,8 +68,8 @@ def _method(name: str, style: Style, **about: Any) -> Method:
 
 
 HOLD_TRUE = _method("hold-true", Style("#7F7F7F", "v", ":", hollow=True, size=6.5))
-ZERO_TRUE = _method("zero-true", Style("#7F7F7F", "D", DASH_DOT_DOT, hollow=True, size=6.5))
-OPTIMAL = _method("optimal", Style("#000000", "x", ":"), needs_link=False, compared=True)
+ZERO_TRUE = _method("zero-true", Style("#A5A5A5", "D", DASH_DOT_DOT, hollow=True, size=6.5))
+OPTIMAL = _method("optimal", Style("#262626", "x", ":"), needs_link=False, compared=True)
 ORACLE = _method("oracle", Style("#000000", "o", "-", hollow=True, size=8.5), compared=True)
-ORACLE_TEACHER = _method("oracle-teacher", Style("#7F7F7F", "d", "-.", hollow=True, size=8.5))
-CEILING = _method("ceiling", Style("#000000", "h", "-", hollow=True, size=8.5))
+ORACLE_TEACHER = _method("oracle-teacher", Style("#666666", "d", "-.", hollow=True, size=8.5))
+CEILING = _method("ceiling", Style("#404040", "h", "-", hollow=True, size=8.5))
