@@ -64,7 +64,7 @@ def test_a_scheduler_from_a_file(load):
         (gain["method"], gain["over"]) for gain in result["gains"]
     }
     pytest.importorskip("matplotlib")
-    assert len(result["figures"]) == 2
+    assert len(result["figures"]) == 3  # PNG, SVG, PDF
 
 
 def test_a_law_from_a_file(load):

@@ -103,9 +103,9 @@ def test_the_pictures_of_the_documentation_are_drawn_by_the_script(tmp_path):
     page = (ROOT / "docs/how-to/figures.md").read_text()
     for name in made:
         assert f"figures/{name}" in page
-        pixels = [
-            np.asarray(image.open(folder / name).convert("L"), float)
-            for folder in (tmp_path, ROOT / "docs/figures")
-        ]
+        pixels = []
+        for folder in (tmp_path, ROOT / "docs/figures"):
+            with image.open(folder / name) as picture:
+                pixels.append(np.asarray(picture.convert("L"), float))
         assert pixels[0].shape == pixels[1].shape, name
         assert np.abs(pixels[0] - pixels[1]).mean() < 3, name

@@ -10,6 +10,7 @@ import pytest
 from command_line import ENVIRONMENT, Shell, assert_one_line_error, block, open_shell
 
 from hjepa_cli import plugins
+from hjepa_cli.cli.commands import LOOKS
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.errors import Interrupted
 from hjepa_cli.output.screen import Screen
@@ -62,7 +63,7 @@ def test_a_stage_runs_and_plans_with_the_inputs_that_it_declares(name):
             for key, parameter in signature.parameters.items()
             if parameter.kind is parameter.KEYWORD_ONLY
         }
-        assert keywords.keys() == {"out", *stage.inputs}
+        assert keywords.keys() - {*LOOKS} == {"out", *stage.inputs}
         assert all(parameter.default is not parameter.empty for parameter in keywords.values())
 
 
