@@ -175,7 +175,7 @@ def test_results_do_not_depend_on_the_run(stage, tmp_path):
     stage.figures = True
     first, second = stage(), stage()
     assert first["csv"] != second["csv"]
-    assert len(first["figures"]) == 2
+    assert len(first["figures"]) == 3
     for a, b in zip(
         [first["csv"], *first["figures"]], [second["csv"], *second["figures"]], strict=True
     ):
