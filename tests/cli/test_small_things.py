@@ -153,7 +153,7 @@ def test_sizes_of_conditions_are_those_of_things() -> None:
 @pytest.mark.parametrize(
     ("command", "fragment"),
     [
-        ("view --devices 300", "300 devices: a GIF has room for 248"),
+        ("view --devices 300", "300 devices: a GIF of 1920 × 1440 has room for 24"),
         ("view --out a.txt", "no animation format '.txt'"),
         ("view --fps 90", "a GIF holds at most 50"),
         ("view --live", "--live needs a terminal"),
