@@ -130,9 +130,10 @@ def test_the_pictures_of_the_documentation_are_drawn_by_the_script(tmp_path):
     page = (ROOT / "docs/figures.md").read_text()
     for name in made:
         assert f"figures/{name}" in page
-        pixels = [
-            np.asarray(image.open(folder / name).convert("L"), float)
-            for folder in (tmp_path, ROOT / "docs/figures")
-        ]
+        pixels = []
+        for folder in (tmp_path, ROOT / "docs/figures"):
+            with image.open(folder / name) as picture:  # of a film one in its middle
+                picture.seek(getattr(picture, "n_frames", 1) // 2)
+                pixels.append(np.asarray(picture.convert("L"), float))
         assert pixels[0].shape == pixels[1].shape, name
         assert np.abs(pixels[0] - pixels[1]).mean() < 3, name
