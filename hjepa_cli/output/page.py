@@ -44,7 +44,7 @@ def explained(name: str) -> str:
         return EXPLAINED[method]
     for pattern, text in FAMILIES:
         if found := re.fullmatch(pattern, method):
-            return text.format(found[1])
+            return text.format(found[1]).replace(" 1 steps", " one step")
     return f"a plugin's method; it sends: {METHODS[method].sends}" if method in METHODS else ""
 
 

@@ -578,3 +578,13 @@ def test_a_wrong_label_is_refused_before_anything_is_planned(shell):
 def test_a_dollar_is_a_dollar():
     assert looks.Looks.of(title="$1 and $2").titled("") == r"\$1 and \$2"
     assert looks.Looks.of(labels=["hold=$"]).named("hold") == r"\$"
+
+
+def test_scale_draws_what_is_asked_for_and_a_finished_run_again(shell):
+    words = ("scale", "--tolerance-steps", "80", "--snr", "10:30", "--out", "s")
+    first = shell(*words, "--json").document
+    assert {Path(path).suffix for path in first["figures"]} == {".png", ".svg", ".pdf"}
+    assert "<!-- again -->" not in Path("s/devices.svg").read_text()
+    again = shell(*words, "--title", "again", "--json").document
+    assert "<!-- again -->" in Path("s/devices.svg").read_text()
+    assert again["rows"] == first["rows"] and again["figures"] == first["figures"]
