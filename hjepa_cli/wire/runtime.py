@@ -128,20 +128,18 @@ def _openvino(path: Path, name: str) -> Network:
 
     core, compiled = openvino.Core(), {}
     options = {"INFERENCE_NUM_THREADS": 1, "INFERENCE_PRECISION_HINT": "f32"}
-
-    def run(*inputs: NDArray[Any]) -> list[NDArray[Any]]:
-        rows = len(inputs[0])
-        if rows not in compiled:
+    try:
+        for rows in BUCKETS:  # all now: a compilation takes as long as many steps
             model = core.read_model(path)
             model.reshape({port: [rows, *port.partial_shape[1:]] for port in model.inputs})
             compiled[rows] = core.compile_model(model, "CPU", options).create_infer_request()
-        outputs = compiled[rows].infer(dict(enumerate(inputs)), share_inputs=True)
-        return [np.array(outputs[port]) for port in outputs]
-
-    try:
-        core.read_model(path)
     except Exception as error:
         raise DataError(f"openvino cannot load network '{name}': {_first(error)}") from None
+
+    def run(*inputs: NDArray[Any]) -> list[NDArray[Any]]:
+        outputs = compiled[len(inputs[0])].infer(dict(enumerate(inputs)), share_inputs=True)
+        return [np.array(outputs[port]) for port in outputs]
+
     return run
 
 
