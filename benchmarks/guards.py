@@ -73,7 +73,7 @@ NOT_HELD = ((FILES, "    if inode is None:\n        return\n", "    return\n"),)
 GUARDS: dict[str, tuple[Change, ...]] = {
     # 1 – 4: writing
     "test_files.py::test_killed_writers_leave_old_or_new": NOT_ATOMIC,
-    "test_kill.py::test_killed_and_continued_is_whole": NOTHING_SWEPT,
+    "test_kill.py::test_killed_while_it_writes_and_continued_is_whole": NOTHING_SWEPT,
     "test_files.py::test_sweep_spares_living_writers": (
         (FILES, "os.kill(pid, 0)\n                    continue", "os.kill(pid, 0)"),
     ),

@@ -52,6 +52,14 @@ class Looks:
             named[name] = _literal(text)
         return cls(None if title is None else _literal(title), named, log)
 
+    def check_drawn(self, drawn: bool, command: str) -> None:
+        """Raise UsageError for looks of a figure that is not drawn; ``command`` would draw it."""
+        if not drawn and self != Looks():
+            raise UsageError(
+                "--title, --labels, --log and --linear say how a figure looks; none is drawn",
+                hint=f"{command}, with them",
+            )
+
     def wide(self) -> "Looks":
         """Return the same for the width of a page."""
         return dataclasses.replace(self, width_in=PAGE_IN)

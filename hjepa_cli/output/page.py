@@ -1,7 +1,6 @@
 """A report is a page for people: the result first, methods in words, tables that fit on paper."""
 
 import dataclasses
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -10,42 +9,15 @@ from hjepa_cli.plugins import METHODS
 
 MOST_COLUMNS = 8  # of a table beside the first, so that it is never cut on paper
 TEXT_BEGINS = "0123456789-+<>≥≤−"  # what does not begin so is no number
-EXPLAINED = {
-    "hjepa": "predicts the embedding in three strides: a long one, and two that fill it in",
-    "hjepa-fused": "as hjepa, but a packet corrects what was predicted for its time",
-    "linear": "predicts the embedding with a linear map, fitted in closed form",
-    "hold": "acts on each packet and keeps that force until the next one",
-    "zero": "acts on each packet, then exerts no force until the next one",
-    "hold-decay": "acts on each packet, and its force fades with the packet's age; no prediction",
-    "hold-decay-linear": "as hold-decay, with a linear law that was made to fade",
-    "chunk": "a network answers a packet and its age with the next forces; no prediction",
-    "chunk-forces": "as chunk, and it is told the forces that were sent meanwhile",
-    "state-kf": "reads the state off the embedding and tracks it with a Kalman filter",
-    "state-48": "as state-kf, but a device sends four states of 12 bits",
-    "local": "acts on the device itself at every step, and needs no radio",
-    "oracle": "knows the true state of each packet and the exact equations: a perfect model",
-    "oracle-teacher": "as oracle, with the teacher's own law",
-    "ceiling": "as oracle, with the best law known for sparse packets",
-    "hold-true": "as hold, on the true state",
-    "zero-true": "as zero, on the true state",
-    "optimal": "the teacher on the device, on the true state at every step; no radio",
-}
-FAMILIES = (  # of methods whose names hold numbers
-    (r"ts-jepa-(\d+)", "predicts the embedding with one network, {} steps at a time"),
-    (r"supervised-(\d+)", "sends {} raw pictures to a network that acts on them"),
-    (r"autoencoder-(\d+)", "sends {} raw pictures, which are reconstructed and acted on"),
-)
 
 
 def explained(name: str) -> str:
     """Say in a few words what a method does."""
-    method = name.partition("+")[0]  # with the delay at which its packets arrive
-    if method in EXPLAINED:
-        return EXPLAINED[method]
-    for pattern, text in FAMILIES:
-        if found := re.fullmatch(pattern, method):
-            return text.format(found[1]).replace(" 1 steps", " one step")
-    return f"a plugin's method; it sends: {METHODS[method].sends}" if method in METHODS else ""
+    method = name.partition("+")[0]  # without the delay at which its packets arrive
+    if method not in METHODS:
+        return ""
+    one = METHODS[method]
+    return one.does or f"a plugin's method; it sends: {one.sends}"
 
 
 def methods_of(result: Mapping[str, Any]) -> list[str]:

@@ -120,9 +120,7 @@ def run(
     if methods is not None:
         check_methods(tuple(methods))
     asked = Looks.of(title, labels, log)
-    if asked != Looks() and figures is None:
-        asks = "--title, --labels, --log and --linear say how a figure looks; none is drawn"
-        raise UsageError(asks, hint="hjepa compare --figures DIR, with them")
+    asked.check_drawn(figures is not None, "hjepa compare --figures DIR")
     if figures is not None:
         require("matplotlib", "a figure needs matplotlib", "plot")
     found = [open_evaluation(directory, methods) for directory in evaluations(paths)]

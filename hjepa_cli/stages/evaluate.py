@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.config.checks import check_gaps, check_methods, needs_model
+from hjepa_cli.config.checks import check_gaps, check_methods
 from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
@@ -60,9 +60,7 @@ def run(
         DataError: a damaged file, one of another plant, or a figure of models of different seeds.
     """
     asked = Looks.of(title, labels, log)
-    if asked != Looks() and not figure:
-        asks = "--title, --labels, --log and --linear say how a figure looks; none is drawn"
-        raise UsageError(asks, hint="hjepa eval --figure, with them")
+    asked.check_drawn(figure, "hjepa eval --figure")
     if settings.plant == RECORDED:
         refuse_closed_loop(remeasure=remeasure, figure=figure)
         found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}
@@ -178,13 +176,8 @@ def stress_for(models: ModelSet, screen: Screen, record: Run) -> dict[str, Any]:
     """Measure what ``--stress`` asks for; return the document of ``--json``."""
     settings = models.settings
     methods = models.measurable(settings.methods)
-    paths = {name: models.of(name).path for name in methods if needs_model(name)}
     return {
-        "checkpoint": models.path,
-        "checkpoints": {name: path for name, path in paths.items() if path},
-        "training_seeds": models.training_seeds(methods),
-        "plant": settings.plant,
-        "seed": settings.seed,
+        **models.described(methods),
         "methods": {},
         "skipped": models.skipped(settings.methods),
         "stress": measure_stress(models, screen, record),

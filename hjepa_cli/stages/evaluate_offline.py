@@ -193,12 +193,8 @@ def measured(
         under.append({"condition": text, "methods": found})
     return {
         "offline": True,
-        "checkpoint": models.path,
-        "checkpoints": {name: models.of(name).path for name in methods},
-        "training_seeds": models.training_seeds(list(methods)),
-        "plant": settings.plant,
+        **models.described(list(methods)),
         "step_s": settings.recorded.step_s,
-        "seed": seed,
         "dataset": data.path,
         "split": data.rollouts,
         "lossy": bool(data.settings.get("import", {}).get("lossy", False)),

@@ -110,13 +110,8 @@ def curves_for(
         share.finish()
         found |= share.found
     files = ", ".join(dict.fromkeys(str(found[name][1]) for name in methods))
-    paths = {name: models.of(name).path for name in methods if needs_model(name)}
     return {
-        "checkpoint": models.path,
-        "checkpoints": {name: path for name, path in paths.items() if path},
-        "training_seeds": models.training_seeds(methods),
-        "plant": settings.plant,
-        "seed": settings.seed,
+        **models.described(methods),
         "loop_version": LOOP_VERSION,
         "link": link.facts(protocol, len(plant(settings.plant).force_signs)),
         "acceptable_score": protocol.acceptable_score,

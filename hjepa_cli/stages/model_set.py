@@ -134,6 +134,17 @@ class ModelSet:
             given["dataset"] = runs.describe_input(self.dataset.path, self.dataset.digest)
         return given
 
+    def described(self, methods: Sequence[str]) -> dict[str, Any]:
+        """Return what a result of these methods says of its models, plant and seed."""
+        paths = {name: self.of(name).path for name in methods if needs_model(name)}
+        return {
+            "checkpoint": self.path,
+            "checkpoints": {name: path for name, path in paths.items() if path},
+            "training_seeds": self.training_seeds(methods),
+            "plant": self.settings.plant,
+            "seed": self.settings.seed,
+        }
+
     @property
     def beside(self) -> list[Path]:
         """Return the file of the model's own curves; the zoo's is never written, a run's is."""

@@ -366,8 +366,9 @@ def _stress_flaw(stress: Mapping[str, Any] | None) -> str | None:
     for name, entry in stress["methods"].items():
         if [row["condition"] for row in entry["rows"]] != stress["conditions"]:
             return f"stress of '{name}': its rows are not the conditions"
-        rows = [entry["nominal"], *(row["points"] for row in entry["rows"]), entry["means"]]
-        if any(len(row) != len(stress["gaps"]) for row in rows if row is not entry["means"] or row):
+        rows = [entry["nominal"], *(row["points"] for row in entry["rows"])]
+        rows += [entry["means"]] if entry["means"] else []  # none of no conditions
+        if any(len(row) != len(stress["gaps"]) for row in rows):
             return f"stress of '{name}': a row has not one point for each gap"
     return None
 

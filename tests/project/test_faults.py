@@ -3,7 +3,7 @@
 | | fault | test |
 |---|---|---|
 | 1 | SIGKILL during a write | test_files.py::test_killed_writers_leave_old_or_new |
-| 1 | SIGKILL at any moment of a stage | test_kill.py::test_killed_and_continued_is_whole |
+| 1 | SIGKILL at any moment of a stage | test_kill.py::test_killed_while_it_writes_and_continued_is_whole |
 | 2 | orphaned temporary files | test_files.py::test_sweep_spares_living_writers |
 | 2 | two writers of one file | test_races.py::test_two_writers_with_one_pid_do_not_meet |
 | 3 | disk full while writing | test_files.py::test_full_disk |

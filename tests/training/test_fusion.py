@@ -76,7 +76,9 @@ def test_only_the_posterior_is_trained(workplace: Path) -> None:
     before = load_checkpoint(workplace / "model.safetensors").tensors
     after = load_checkpoint(workplace / "run" / "model.safetensors")
     for name, values in before.items():
-        np.testing.assert_allclose(after.tensors[name], values, rtol=2**-8)  # rounded to bfloat16
+        rounded = torch.from_numpy(values).bfloat16().float().numpy()
+        kept = after.tensors[name]
+        assert (kept == rounded).all() or (kept == values).all(), name  # weights, or statistics
     own = after.tensors.keys() - before.keys()
     assert own and all(name.startswith("posterior.") for name in own)
     assert any(np.abs(after.tensors[name]).max() > 0 for name in own if "output" in name)

@@ -53,7 +53,6 @@ def test_candidates_are_driven_as_the_oracle_drives(name: str) -> None:
 
 
 def test_a_price_on_forces_finds_a_softer_law() -> None:
-    """And forces are those of the loop: of a law twice as stiff about twice as much at rest."""
     options = load_settings("gym", flags={"tune.devices": 8, "tune.steps": 300, "tune.rounds": 8})
     search = LawSearch.make(plant("gym"), options.protocol, options.tune, seed=0)
     soft, stiff = (search.gains_n(learnable=learnable) for learnable in (True, False))

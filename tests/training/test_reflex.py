@@ -385,7 +385,9 @@ def test_encoder_and_actor_are_the_models(workplace: Path) -> None:
     taken = load_checkpoint(workplace / "run" / "model.safetensors").tensors
     for name, array in source.items():
         if name.startswith(("encoder.", "actor.")):
-            np.testing.assert_allclose(taken[name], array, rtol=2**-8)  # rounded to bfloat16
+            rounded = torch.from_numpy(array).bfloat16().float().numpy()
+            kept = taken[name]
+            assert (kept == rounded).all() or (kept == array).all(), name  # weights, or statistics
 
 
 @pytest.mark.parametrize("stop", [2, 5])  # in the first network and in the second

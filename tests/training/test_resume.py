@@ -175,23 +175,18 @@ def test_interrupted_at_any_step_and_continued_is_uninterrupted(
     assert_equal_runs(out, workplace / stage)
 
 
-def test_sigreg_goes_on_along_the_directions_that_it_would_have_had(
-    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"encoder__regulariser": "sigreg", "encoder__regulariser_weight": 1.0},  # its directions
+        {"augment__strength": 1.0},  # its pictures
+    ],
+    ids=["sigreg", "augmentation"],
+)
+def test_what_is_drawn_goes_on_as_it_would_have(
+    changes: dict[str, Any], workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    chosen = settings(encoder__regulariser="sigreg", encoder__regulariser_weight=1.0)
-    skip_actor(monkeypatch)
-    for name in ("whole", "interrupted", "interrupted"):
-        with monkeypatch.context() as patched, suppress(Interrupted):
-            if name == "interrupted":
-                signal_after(patched, 3)
-            train_encoder.run(chosen, QUIET, dataset=workplace / "data", out=tmp_path / name)
-    assert_equal_runs(tmp_path / "whole", tmp_path / "interrupted")
-
-
-def test_augmentation_goes_on_with_the_pictures_that_it_would_have_drawn(
-    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen = settings(augment__strength=1.0)
+    chosen = settings(**changes)
     skip_actor(monkeypatch)
     for name in ("whole", "interrupted", "interrupted"):
         with monkeypatch.context() as patched, suppress(Interrupted):

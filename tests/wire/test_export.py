@@ -72,6 +72,18 @@ def test_any_batch_gives_every_row_its_own_result(exported, backend):
         np.testing.assert_allclose(few, z_next[:rows], atol=1e-5)
 
 
+def test_no_batch_is_compiled_while_devices_wait(exported, monkeypatch):
+    """A compilation takes as long as many control steps: all are made before the first one."""
+    openvino = pytest.importorskip("openvino")
+    from hjepa_cli.wire.runtime import Runtime
+
+    runtime = Runtime(open_bundle(exported), "openvino")
+    runtime.warm_up("actor")
+    monkeypatch.setattr(openvino.Core, "compile_model", None)
+    for rows in (1, 3, 16, 64):
+        assert len(runtime.act(np.zeros((rows, 256), np.float32))) == rows
+
+
 def test_follow_is_that_of_the_simulator(exported, checkpoint):
     """Against :func:`planners.follow` in torch, ages of all kinds, 0 and rests of strides too."""
     from hjepa_cli.core.control.planners import Hierarchy

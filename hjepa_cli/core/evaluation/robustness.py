@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.core import statistics
-from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.loop import Outcome
 from hjepa_cli.core.evaluation.protocol import Point, Reference
 from hjepa_cli.core.plants.system import System
@@ -31,14 +30,8 @@ def describe(
     That is ``None`` where the nominal score is 0.
     """
     described = reference.describe(points, outcome)
-    weights = _weights(outcome, reference)
-    for number, point in enumerate(described):
-        scores, beside = outcome.score[number], nominal.score[number]
-        point["relative"] = point["relative_ci95"] = None
-        if beside.any():
-            point["relative"] = float(statistics.ratio(scores, beside))
-            replicates = statistics.ratio(scores, beside, weights)
-            point["relative_ci95"] = statistics.interval(replicates).tolist()
+    for point, beside in zip(described, _beside(outcome, nominal, reference), strict=True):
+        point.update(beside)
     return described
 
 
@@ -56,14 +49,8 @@ def mean_of(
         {"score": float(value), "ci95": [float(low[i]), float(high[i])]}
         for i, value in enumerate(reference.relative_score(mean))
     ]
-    weights = _weights(mean, reference)
-    for value, scores, beside in zip(values, score, nominal.score, strict=True):
-        value["relative"] = value["relative_ci95"] = None
-        if beside.any():
-            value["relative"] = float(statistics.ratio(scores, beside))
-            replicates = statistics.ratio(scores, beside, weights)
-            value["relative_ci95"] = statistics.interval(replicates).tolist()
-    return values
+    beside = _beside(mean, nominal, reference)
+    return [value | one for value, one in zip(values, beside, strict=True)]
 
 
 def kept(outcome: Outcome) -> dict[str, Any]:
@@ -77,7 +64,17 @@ def taken(values: Mapping[str, Any]) -> Outcome:
     return Outcome(**arrays)
 
 
-def _weights(outcome: Outcome, reference: Reference) -> Floats:
-    return statistics.bootstrap_weights(
+def _beside(outcome: Outcome, nominal: Outcome, reference: Reference) -> list[dict[str, Any]]:
+    """Return by gap the score ÷ the nominal one, of the same devices, and its interval."""
+    weights = statistics.bootstrap_weights(
         outcome.score.shape[1], reference.replicates, reference.seed
     )
+    found: list[dict[str, Any]] = []
+    for scores, usual in zip(outcome.score, nominal.score, strict=True):
+        one: dict[str, Any] = {"relative": None, "relative_ci95": None}
+        if usual.any():
+            one["relative"] = float(statistics.ratio(scores, usual))
+            replicates = statistics.ratio(scores, usual, weights)
+            one["relative_ci95"] = statistics.interval(replicates).tolist()
+        found.append(one)
+    return found

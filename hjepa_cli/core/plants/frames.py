@@ -5,12 +5,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hjepa_cli.config.checks import FARTHEST_BACK
 from hjepa_cli.core.arrays import Integers, Pixels, finite
 from hjepa_cli.core.plants.system import Camera
 
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 FRAME_SHAPE = (HEIGHT_PX, WIDTH_PX, CHANNELS)
-LONGEST = 16  # frames that a device keeps, from which its network sees κ
+LONGEST = FARTHEST_BACK + 1  # frames that a device keeps, from which its network sees κ
 
 
 def frame_bits(frame_shape: tuple[int, int, int]) -> int:

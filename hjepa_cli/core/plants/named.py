@@ -5,7 +5,7 @@ import hashlib
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -28,6 +28,7 @@ from hjepa_cli.errors import ArrayError, UsageError
 
 VERSIONED = ("desktop", "gym")
 IDEAL = SensorSettings()
+Section = TypeVar("Section")
 START = np.array([0.03, 0.1, 0.08, 0.5])  # m, m/s, rad, rad/s: where a seeded CartPole starts
 
 
@@ -89,10 +90,7 @@ def camera_in(settings: Mapping[str, Any]) -> CameraSettings:
     Raises:
         UsageError: it is none.
     """
-    try:
-        return msgspec.convert(settings.get("camera", {}), CameraSettings)
-    except (msgspec.ValidationError, AttributeError) as flaw:
-        raise UsageError(f"no size of pictures: {flaw}") from None
+    return _section(settings, "camera", CameraSettings, "size of pictures")
 
 
 def sensor_in(record: Mapping[str, Any]) -> SensorSettings:
@@ -101,10 +99,14 @@ def sensor_in(record: Mapping[str, Any]) -> SensorSettings:
     Raises:
         UsageError: it is none.
     """
+    return _section(record, "sensor", SensorSettings, "sensor of a camera")
+
+
+def _section(record: Mapping[str, Any], name: str, kind: type[Section], what: str) -> Section:
     try:
-        return msgspec.convert(record.get("sensor", {}), SensorSettings)
+        return msgspec.convert(record.get(name, {}), kind)
     except (msgspec.ValidationError, AttributeError) as flaw:
-        raise UsageError(f"no sensor of a camera: {flaw}") from None
+        raise UsageError(f"no {what}: {flaw}") from None
 
 
 def seen_as_trained(settings: Settings, record: Mapping[str, Any]) -> Settings:

@@ -72,6 +72,7 @@ STATE_KF = Method(
     trained_by=training("train-hierarchy"),
     fitted=True,
     style=Style("#332288", "*", "--", size=5.5),
+    does="reads the state off the embedding and tracks it with a Kalman filter",
 )
 STATE_48 = Method(
     "state-48",
@@ -81,4 +82,5 @@ STATE_48 = Method(
     trained_by=_training_of_four_states,
     fitted=True,
     style=Style("#8A7FD1", "8", "-."),
+    does="as state-kf, but a device sends four states of 12 bits",
 )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
 
 
-def _method(name: str, *, keep: bool, style: Style) -> Method:
+def _method(name: str, *, keep: bool, style: Style, does: str) -> Method:
     def build(settings: Settings, model: Model) -> Driver:
         from hjepa_cli.core.control.drivers import embedding_driver, last_force
 
@@ -30,6 +30,7 @@ def _method(name: str, *, keep: bool, style: Style) -> Method:
         trained_by=training("train-hierarchy"),
         compared=True,
         style=style,
+        does=does,
     )
 
 
@@ -43,8 +44,18 @@ def _local(settings: Settings, model: Model) -> Driver:
     return Driver("local", sensor, drives, drives, 0, "local", uses_link=False)
 
 
-HOLD = _method("hold", keep=True, style=Style("#CC79A7", "v", ":"))
-ZERO = _method("zero", keep=False, style=Style("#E69F00", "D", DASH_DOT_DOT, size=3.5))
+HOLD = _method(
+    "hold",
+    keep=True,
+    style=Style("#CC79A7", "v", ":"),
+    does="acts on each packet and keeps that force until the next one",
+)
+ZERO = _method(
+    "zero",
+    keep=False,
+    style=Style("#E69F00", "D", DASH_DOT_DOT, size=3.5),
+    does="acts on each packet, then exerts no force until the next one",
+)
 LOCAL = Method(
     "local",
     "nothing",
@@ -53,4 +64,5 @@ LOCAL = Method(
     trained_by=training("train-hierarchy"),
     needs_link=False,
     style=Style("#595959", "s", ":", hollow=True, size=6.5),
+    does="acts on the device itself at every step, and needs no radio",
 )

@@ -45,6 +45,7 @@ class Method:
         reflex: it answers a packet by its age, and predicts nothing.
         compared: it is in the figure of ``eval`` unless methods are named.
         style: how figures draw it; ``None`` leaves that to them.
+        does: what it does, in a few words for readers of a report, as "predicts the embedding".
         planner: makes the planner of a model's own predictor, for methods that play one.
         kind: of the architectures that a plugin's own training writes, which offer the method;
         modules: builds the untrained networks of such an architecture, by the arguments of
@@ -61,6 +62,7 @@ class Method:
     reflex: bool = False
     compared: bool = False
     style: Style | None = None
+    does: str = ""
     planner: Callable[[Model], Planner] | None = None
     kind: str | None = None
     modules: Modules | None = None
@@ -73,6 +75,7 @@ class Method:
         check_members(self, callable, "build", "offered", "trained_by")
         check_members(self, callable, "planner", "modules", optional=True)
         check_members(self, bool, "needs_link", "fitted", "reflex", "compared")
+        check_members(self, str, "does")
         check_members(self, str, "kind", optional=True)
         check_members(self, Style, "style", optional=True)
 

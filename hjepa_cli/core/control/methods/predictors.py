@@ -84,6 +84,7 @@ HJEPA = predictor(
     trained_by=training("train-hierarchy"),
     compared=True,
     style=Style("#0072B2", "o", size=7.0),
+    does="predicts the embedding in three strides: a long one, and two that fill it in",
 )
 
 HJEPA_FUSED = predictor(
@@ -93,6 +94,7 @@ HJEPA_FUSED = predictor(
     offered=lambda architecture, plant: bool(architecture.get("fusion")),
     trained_by=training("train-fusion"),
     style=Style("#00366B", "H", ":", size=7.0),
+    does="as hjepa, but a packet corrects what was predicted for its time",
 )
 
 _STYLES = {  # of the depths that the paper compares
@@ -124,6 +126,7 @@ def _ts_jepa(name: str) -> Method | None:
         trained_by=training("train-hierarchy", f" --h {depth}" if depth > 1 else ""),
         compared=depth in _STYLES,
         style=_STYLES.get(depth),
+        does=f"predicts the embedding with one network, {depth} step{'s' * (depth > 1)} at a time",
     )
 
 
@@ -150,4 +153,5 @@ LINEAR = Method(
     trained_by=training("train-hierarchy"),
     fitted=True,
     style=Style("#44AA99", "d", "--"),
+    does="predicts the embedding with a linear map, fitted in closed form",
 )

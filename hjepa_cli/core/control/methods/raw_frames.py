@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
 
 
-def _method(kind: str, frames: int, style: Style) -> Method:
+def _method(kind: str, frames: int, style: Style, does: str) -> Method:
     """Describe the baseline of an encoder's training method on κ frames."""
     name = f"{kind}-{frames}"
 
@@ -47,9 +47,12 @@ def _method(kind: str, frames: int, style: Style) -> Method:
         ),
         compared=True,
         style=style,
+        does=f"sends {frames} raw pictures {does}",
     )
 
 
-SUPERVISED_2 = _method("supervised", 2, Style("#882255", "P", "--"))
-SUPERVISED_4 = _method("supervised", 4, Style("#AA4466", "X", "-."))
-AUTOENCODER_2 = _method("autoencoder", 2, Style("#999933", "h", "--"))
+_ACTED_ON = "to a network that acts on them"
+_RECONSTRUCTED = "that are reconstructed and acted on"
+SUPERVISED_2 = _method("supervised", 2, Style("#882255", "P", "--"), _ACTED_ON)
+SUPERVISED_4 = _method("supervised", 4, Style("#AA4466", "X", "-."), _ACTED_ON)
+AUTOENCODER_2 = _method("autoencoder", 2, Style("#999933", "h", "--"), _RECONSTRUCTED)

@@ -39,7 +39,10 @@ def _chunked(name: str, model: Model) -> Callable[[int], Controller]:
 
 
 def _method(
-    name: str, controller: Callable[[str, Model], Callable[[int], Controller]], style: Style
+    name: str,
+    controller: Callable[[str, Model], Callable[[int], Controller]],
+    style: Style,
+    does: str,
 ) -> Method:
     def build(settings: Settings, model: Model) -> Driver:
         from hjepa_cli.core.control.drivers import embedding_driver
@@ -54,12 +57,31 @@ def _method(
         trained_by=training("train-reflex"),
         reflex=True,
         style=style,
+        does=does,
     )
 
 
-HOLD_DECAY = _method("hold-decay", _decaying, Style("#9467BD", "^", "-.", hollow=True, size=5.0))
-HOLD_DECAY_LINEAR = _method(
-    "hold-decay-linear", _decaying, Style("#6A3D9A", ">", "--", hollow=True, size=5.0)
+HOLD_DECAY = _method(
+    "hold-decay",
+    _decaying,
+    Style("#9467BD", "^", "-.", hollow=True, size=5.0),
+    "acts on each packet, and its force fades with the packet's age; no prediction",
 )
-CHUNK = _method("chunk", _chunked, Style("#117733", "X", "--", hollow=True, size=5.0))
-CHUNK_FORCES = _method("chunk-forces", _chunked, Style("#66A61E", "P", "-.", hollow=True, size=5.0))
+HOLD_DECAY_LINEAR = _method(
+    "hold-decay-linear",
+    _decaying,
+    Style("#6A3D9A", ">", "--", hollow=True, size=5.0),
+    "as hold-decay, with a linear law that was made to fade",
+)
+CHUNK = _method(
+    "chunk",
+    _chunked,
+    Style("#117733", "X", "--", hollow=True, size=5.0),
+    "a network answers a packet and its age with the next forces; no prediction",
+)
+CHUNK_FORCES = _method(
+    "chunk-forces",
+    _chunked,
+    Style("#66A61E", "P", "-.", hollow=True, size=5.0),
+    "as chunk, and it is told the forces that were sent meanwhile",
+)

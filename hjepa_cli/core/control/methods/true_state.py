@@ -67,9 +67,36 @@ def _method(name: str, style: Style, **about: Any) -> Method:
     return Method(name, "true state", build, style=style, **about)
 
 
-HOLD_TRUE = _method("hold-true", Style("#7F7F7F", "v", ":", hollow=True, size=6.5))
-ZERO_TRUE = _method("zero-true", Style("#A5A5A5", "D", DASH_DOT_DOT, hollow=True, size=6.5))
-OPTIMAL = _method("optimal", Style("#262626", "x", ":"), needs_link=False, compared=True)
-ORACLE = _method("oracle", Style("#000000", "o", "-", hollow=True, size=8.5), compared=True)
-ORACLE_TEACHER = _method("oracle-teacher", Style("#666666", "d", "-.", hollow=True, size=8.5))
-CEILING = _method("ceiling", Style("#404040", "h", "-", hollow=True, size=8.5))
+HOLD_TRUE = _method(
+    "hold-true",
+    Style("#7F7F7F", "v", ":", hollow=True, size=6.5),
+    does="as hold, on the true state",
+)
+ZERO_TRUE = _method(
+    "zero-true",
+    Style("#A5A5A5", "D", DASH_DOT_DOT, hollow=True, size=6.5),
+    does="as zero, on the true state",
+)
+OPTIMAL = _method(
+    "optimal",
+    Style("#262626", "x", ":"),
+    needs_link=False,
+    compared=True,
+    does="the teacher on the device, on the true state at every step; no radio",
+)
+ORACLE = _method(
+    "oracle",
+    Style("#000000", "o", "-", hollow=True, size=8.5),
+    compared=True,
+    does="knows the true state of each packet and the exact equations: a perfect model",
+)
+ORACLE_TEACHER = _method(
+    "oracle-teacher",
+    Style("#666666", "d", "-.", hollow=True, size=8.5),
+    does="as oracle, with the teacher's own law",
+)
+CEILING = _method(
+    "ceiling",
+    Style("#404040", "h", "-", hollow=True, size=8.5),
+    does="as oracle, with the best law known for sparse packets",
+)
