@@ -216,7 +216,8 @@ class AugmentSettings:
     """
 
     strength: NotNegative = 0.0
-    share: Annotated[float, Meta(ge=0, le=1)] = 0.5  # of pictures, for each effect by itself
+    clean: Annotated[float, Meta(ge=0, le=1)] = 0.5  # share of pictures that stay as they are
+    share: Annotated[float, Meta(ge=0, le=1)] = 0.5  # of the others, for each effect by itself
     gain: BelowOne = 0.35  # ± of 1
     gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
     colour: BelowOne = 0.1  # ± of each channel

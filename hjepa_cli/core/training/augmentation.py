@@ -72,6 +72,9 @@ class Augmentation:
         strip = torch.randn(NOISE_INPUTS * size, generator=on_device, device=before.device)
         for clean, worse, drawn, moves_px in zip(before, after, numbers, jitter_px, strict=True):
             draws = _Draws(self._of, drawn)
+            if draws.uniform() < self._of.clean:
+                worse.copy_(clean)
+                continue
             pictures = self._moved(clean.float(), moves_px, draws)
             self._cover(pictures, draws)
             pictures = self._blurred(pictures, draws)
