@@ -117,7 +117,13 @@ class RecordedSettings:
 class CollectSettings:
     """These settings say how ``collect`` makes the dataset."""
 
-    trajectories: Annotated[Count, Flag("--trajectories", "Training trajectories.")] = 200
+    trajectories: Annotated[
+        Count,
+        Flag(
+            "--trajectories",
+            "Training trajectories by the teacher, and as many by a tuned law.",
+        ),
+    ] = 200
     test_trajectories: Annotated[Count, Flag("--test-trajectories", "Held-out trajectories.")] = 40
     clean_trajectories: Count = 40
     steps: Annotated[CountFromTwo, Flag("--steps", "Control steps per trajectory.")] = 100
@@ -155,14 +161,14 @@ class EncoderSettings:
     frames: Annotated[  # κ
         Count,
         Flag("--frames", "Frames of the input: 2 or 4; 2 with --method autoencoder."),
-    ] = 2
+    ] = 4
     frame_gap: Count = 1  # control steps between them
     embedding: Width = 256
     hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
     frame_input: Literal["difference", "pair"] = "difference"
     # Each frame is fitted to its background: not, by a gain, or by gain and offset.
-    photometric: Literal["none", "gain", "affine"] = "none"
+    photometric: Literal["none", "gain", "affine"] = "affine"
     stride_actions: Literal["all", "held"] = "all"
     residual: bool = True
     centre: bool = True
@@ -212,11 +218,15 @@ class EncoderSettings:
 class AugmentSettings:
     """Networks are trained on worse pictures, with the labels and targets of clean ones.
 
-    ``strength`` multiplies what follows it, each the most that a training picture gets; 0 is off.
+    Baselines on raw frames see them from the beginning; the encoder of a JEPA for some more steps,
+    in which it learns to see what it has seen in clean ones. ``strength`` multiplies all from
+    ``gain`` on, each the most that a training picture gets; 0 is off.
     """
 
-    strength: NotNegative = 0.0
-    clean: Annotated[float, Meta(ge=0, le=1)] = 0.5  # share of pictures that stay as they are
+    strength: NotNegative = 1.0
+    steps: Count = 600
+    learning_rate: NotNegative = 5e-4
+    clean: Annotated[float, Meta(ge=0, le=1)] = 0.25  # share of pictures that stay as they are
     share: Annotated[float, Meta(ge=0, le=1)] = 0.5  # of the others, for each effect by itself
     gain: BelowOne = 0.35  # ± of 1
     gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
@@ -224,10 +234,10 @@ class AugmentSettings:
     gradient: BelowOne = 0.25  # fall of light from edge to edge, in any direction
     flicker: BelowOne = 0.02  # less light in a frame
     shot_noise: NotNegative = 4.0  # standard deviation at white, of 255
-    read_noise: NotNegative = 10.0
+    read_noise: NotNegative = 14.0
     blur_px: NotNegative = 1.75  # standard deviation
     jitter_px: NotNegative = 0.12  # standard deviation, anew in every frame
-    rotation_deg: NotNegative = 2.5
+    rotation_deg: NotNegative = 4.0
     rectangle_px: NotNegative = 16.0  # side, of any grey
 
 

@@ -129,12 +129,13 @@ def plan(settings: Settings, *, out: Path | None = None) -> Plan:
     elif out is not None:
         refuse_foreign(out, "dataset", lambda name: name == LOG or bool(NAME.fullmatch(name)))
         check_same(out, settings)
-    options, sizes = settings.collect, split_sizes(settings.collect).values()
-    steps = sum(count * steps for count, steps in sizes)
-    frames = steps + sum(count for count, _ in sizes) if options.frames == "stored" else 0
+    sizes = split_sizes(settings)
+    train, test, clean = (count for count, _ in sizes.values())
+    steps = sum(count * steps for count, steps in sizes.values())
+    frames = steps + train + test + clean if settings.collect.frames == "stored" else 0
     work = [
-        f"simulate {options.trajectories} training, {options.test_trajectories} held-out and "
-        f"{options.clean_trajectories} clean trajectories of plant {settings.plant} ({steps} steps)"
+        f"simulate {train} training, {test} held-out and "
+        f"{clean} clean trajectories of plant {settings.plant} ({steps} steps)"
     ]
     if frames:
         height_px, width_px, channels = settings.camera.frame_shape
@@ -237,7 +238,7 @@ def check(settings: Settings) -> None:
             key="sensor.ideal",
         )
     camera_of(plant(settings.plant), settings.camera, settings.sensor)
-    total = sum(count for count, _ in split_sizes(settings.collect).values())
+    total = sum(count for count, _ in split_sizes(settings).values())
     most = MAX_SHARDS * per_shard(settings.collect.frames == "stored")
     if total > most:
         raise UsageError(
@@ -249,7 +250,7 @@ def check(settings: Settings) -> None:
 
 def shards_of(settings: Settings) -> list[Shard]:
     """Return the shards that the settings make."""
-    sizes = {name: count for name, (count, _) in split_sizes(settings.collect).items()}
+    sizes = {name: count for name, (count, _) in split_sizes(settings).items()}
     return cut(sizes, per_shard(settings.collect.frames == "stored"))
 
 
@@ -258,7 +259,7 @@ def make_shards(
 ) -> list[Described]:
     """Simulate, and render if frames are stored, every shard that is not there yet."""
     shards, stored = shards_of(settings), settings.collect.frames == "stored"
-    sizes = split_sizes(settings.collect)
+    sizes = split_sizes(settings)
 
     def is_done(shard: Shard) -> bool:
         count, (_, steps) = shard.stop - shard.start, sizes[shard.split]
@@ -302,7 +303,7 @@ def size_bytes(settings: Settings) -> int:
     frame_bytes = stored * frame_bits(settings.camera.frame_shape) // 8
     return sum(
         count * ((steps + 1) * (state_bytes + frame_bytes) + force_bytes * steps)
-        for count, steps in split_sizes(settings.collect).values()
+        for count, steps in split_sizes(settings).values()
     )
 
 
@@ -315,7 +316,7 @@ def memory_bytes(settings: Settings) -> int:
     row_bytes += 2 * frame_bits(settings.camera.frame_shape) // 8 * stored
     return max(
         min(count, per_shard(stored)) * (steps + 1) * row_bytes
-        for count, steps in split_sizes(collect).values()
+        for count, steps in split_sizes(settings).values()
     )
 
 

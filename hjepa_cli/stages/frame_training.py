@@ -15,6 +15,7 @@ from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import FrameWindows
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
+from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
@@ -33,14 +34,21 @@ def fit(
     run: TrainingRun,
     train: RenderedSplit,
     phase: str,
-    objective: Jepa | Imitation | Reconstruction,
+    objective: Jepa | Hardening | Imitation | Reconstruction,
     look: Callable[[dict[str, float]], dict[str, Any]],
+    *,
+    augmented: bool = True,
+    steps: int | None = None,
+    learning_rate: float | None = None,
 ) -> None:
     """Train for ``encoder.steps`` steps, all phases on the same windows.
 
-    Every batch is ``batch_trajectories`` windows of ``batch_frames`` frames, h steps apart, which
-    networks see augmented, if the settings say so. Every
+    Every batch is ``batch_trajectories`` windows of ``batch_frames`` frames, h steps apart. Every
     epoch ``look`` is called with the loss terms and returns a row of ``metrics.csv``.
+
+    Args:
+        augmented: whether networks see the windows as ``[augment]`` makes them.
+        steps, learning_rate: others than those of ``[encoder]``.
 
     Raises:
         NumericalError: training diverged.
@@ -51,8 +59,8 @@ def fit(
         objective.parameters(),
         name=options.optimizer,
         schedule=options.schedule,
-        steps=options.steps,
-        learning_rate=options.learning_rate,
+        steps=options.steps if steps is None else steps,
+        learning_rate=options.learning_rate if learning_rate is None else learning_rate,
         weight_decay=options.weight_decay,
         gradient_clip=options.gradient_clip,
         ranks=ranks,
@@ -79,7 +87,7 @@ def fit(
     def draw() -> Drawn:
         objective.train()
         batch = windows.draw(count, stream, share)
-        if seeds := augment.draw(count, stream):
+        if augmented and (seeds := augment.draw(count, stream)):
             worse = augment(batch.frames.to(device), seeds[share])
             batch = dataclasses.replace(batch, worse=worse)
         losses = objective.losses(batch)

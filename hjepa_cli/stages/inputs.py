@@ -63,7 +63,7 @@ def embed(
     frames, frame_gap = look or getattr(encoder, "look", (2, 1))
     parts = []
     for start in range(0, len(split.frames), CHUNK):
-        part = split.slice(start, start + CHUNK)
+        part = split[start : start + CHUNK]
         seen = part.seen(every, frames=frames, frame_gap=frame_gap, mirrored=mirrored)
         if shifts_px is not None:
             by_trajectory = seen.unflatten(0, (len(part.frames), -1))
@@ -201,7 +201,7 @@ def render(
 
 def count_frames(data: Dataset | None, settings: Settings, *splits: str) -> int:
     """Return the frames of splits; of no dataset, those that the settings would collect."""
-    sizes = split_sizes(settings.collect)
+    sizes = split_sizes(settings)
     if data:
         sizes = {name: (of["trajectories"], of["steps"]) for name, of in data.splits.items()}
     return sum(count * (steps + 1) for count, steps in (sizes[name] for name in splits))

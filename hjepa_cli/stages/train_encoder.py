@@ -15,11 +15,13 @@ from torch import nn
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.config.schema import RECORDED, Settings, dotted
+from hjepa_cli.core.datasets.trajectories import driven_by_teacher
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import tensors_of
 from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.plants.named import plant_of
+from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
 from hjepa_cli.core.training.optimiser import fit_actor
 from hjepa_cli.core.training.ranks import joined
@@ -172,7 +174,10 @@ def train_jepa(
     encoder, companion = modules["encoder"], modules["high"]
     assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
     look = {"frames_each": options.frames, "frame_gap": options.frame_gap}
-    encoder.fit_standardisation(standardisation_sample(train.frames, **look))
+    # Laws and wrong beliefs throw a device about; from what the teacher does, embeddings become
+    # smoother in the states, and are as good in all of the others (docs/LOG.md).
+    calm = train[driven_by_teacher(settings)]
+    encoder.fit_standardisation(standardisation_sample(calm.frames, **look))
     if ranks.size > 1:
         if options.regulariser != "none":
             raise UsageError(
@@ -195,13 +200,25 @@ def train_jepa(
         seed=settings.seed,
     )
 
-    def watch(terms: dict[str, float]) -> dict[str, Any]:
-        few, every = train.slice(0, WATCHED), math.gcd(4, options.h)
-        report = examine(encoder, companion, few, test, settings, every=every)
-        return {f"loss_{name}": value for name, value in terms.items()} | dotted(report, "_")
+    augment, terms_of_all = settings.augment, [*jepa.weights]
+    if augment.strength:
+        terms_of_all.append("hardening")
 
-    fit(run, train, "jepa", jepa, watch)
+    def watch(terms: dict[str, float]) -> dict[str, Any]:
+        few, every = train[:WATCHED], math.gcd(4, options.h)
+        report = examine(encoder, companion, few, test, settings, every=every)
+        losses = {f"loss_{name}": terms.get(name) for name in terms_of_all}
+        return losses | dotted(report, "_")
+
+    fit(run, calm, "jepa", jepa, watch, augmented=False)
     encoder.eval()
+    if augment.strength:
+        hardening = Hardening(modules, resolve_device(settings.device))
+        fit(
+            *(run, train, "hardening", hardening, watch),
+            steps=augment.steps,
+            learning_rate=augment.learning_rate,
+        )
     if not ranks.leads:
         return {}
     run.screen.say("measuring health on all frames and fitting the probe actor")

@@ -17,10 +17,14 @@ START, BELIEF, PACKET = 0.5, 0.3, (0.2, 0.8)
 SPLITS = ("train", "test", "clean")
 
 
-def split_sizes(collect: CollectSettings) -> dict[str, tuple[int, int]]:
-    """Return trajectories and control steps of every split."""
+def split_sizes(settings: Settings) -> dict[str, tuple[int, int]]:
+    """Return trajectories and control steps of every split.
+
+    A tuned law drives as many in training as the plant's own teacher.
+    """
+    collect, laws = settings.collect, 2 if settings.control.gains_n else 1
     return {
-        "train": (collect.trajectories, collect.steps),
+        "train": (laws * collect.trajectories, collect.steps),
         "test": (collect.test_trajectories, collect.steps),
         "clean": (collect.clean_trajectories, collect.clean_steps),
     }
@@ -40,7 +44,7 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     a packet comes: forces that do not fit the state are what a controller plays in closed loop.
     """
     kind, clean = plant(settings.plant), split == "clean"
-    size, steps = split_sizes(settings.collect)[split]
+    size, steps = split_sizes(settings)[split]
     indices = range(size) if rows is None else rows
     streams = (generator(settings.seed, STREAM, SPLITS.index(split), i) for i in indices)
     shape = (steps, *kind.action_shape)
@@ -51,8 +55,9 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
     # Methods are measured on clean rollouts.
     moved = actual_plant(settings.plant, settings.conditions) if clean else kind
     law_n, own_n = control_law(kind, settings.control), kind.teacher()
-    simulation, by_law = moved.simulation(count), np.zeros(count, bool)
-    if law_n is not own_n and not clean:
+    simulation = moved.simulation(count)
+    by_law = np.zeros(count, bool)
+    if settings.control.gains_n and not clean:
         by_law = np.arange(indices.start, indices.stop) % 2 == 0
     initial[by_law] *= START
     if driven := by_law.sum():
@@ -76,6 +81,11 @@ def generate(settings: Settings, split: str, rows: range | None = None) -> Traje
             believed = kind.advance(believed, applied_n[by_law, k])
         simulation.step(applied_n[:, k])
     return Trajectories(*(array.astype(np.float32) for array in (states, applied_n, teacher_n)))
+
+
+def driven_by_teacher(settings: Settings) -> slice:
+    """Return which trajectories of training the plant's own teacher drives."""
+    return slice(1, None, 2) if settings.control.gains_n else slice(None)
 
 
 def _draw(

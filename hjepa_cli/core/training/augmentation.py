@@ -85,9 +85,8 @@ class Augmentation:
 
     def _moved(self, pictures: Tensor, moves_px: Tensor, draws: "_Draws") -> Tensor:
         """Turn pictures [κ, H, W, C] around their middle, and move each by parts of a pixel."""
-        chosen = draws.chosen()
-        angle = math.radians(draws.both_ways(self._of.rotation_deg, chosen))
-        jitter_px = draws.most(self._of.jitter_px) * chosen
+        angle = math.radians(draws.both_ways(self._of.rotation_deg, draws.chosen()))
+        jitter_px = draws.most(self._of.jitter_px) * draws.chosen()
         if not (angle or jitter_px):
             return pictures
         height, width = pictures.shape[1:3]

@@ -82,12 +82,11 @@ class Jepa:
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
         """Return scalar loss terms of a batch, before weighting, under the names of ``weights``.
 
-        Frames are [B · F, κ, H, W, 3], actions [B, F − 1, h, *A]. The context encoder sees worse
-        ones, if there are any, the target never.
+        Frames are [B · F, κ, H, W, 3], actions [B, F − 1, h, *A].
         """
         frames, actions = batch.frames.to(self.device), batch.actions.to(self.device)
         windows, strides = actions.shape[0], actions.shape[1]
-        z = self.encoder(batch.seen.to(self.device)).unflatten(0, (windows, strides + 1))
+        z = self.encoder(frames).unflatten(0, (windows, strides + 1))
         with torch.no_grad():
             targets = self.target.module(frames).unflatten(0, (windows, strides + 1))
         starts = torch.arange(strides, device=self.device)

@@ -36,10 +36,10 @@ class RenderedSplit:
         seen = self.frames[:, torch.from_numpy(frames_seen(steps, frames, frame_gap))]
         return (seen.flip(-2) if mirrored else seen).flatten(0, 1)
 
-    def slice(self, start: int, stop: int) -> "RenderedSplit":
-        """Return trajectories ``start`` … ``stop`` − 1."""
+    def __getitem__(self, rows: slice) -> "RenderedSplit":
+        """Return some trajectories, without a copy."""
         arrays = (self.frames, self.states, self.actions, self.labels)
-        return RenderedSplit(*(values[start:stop] for values in arrays))
+        return RenderedSplit(*(values[rows] for values in arrays))
 
     def states_at(self, every: int) -> Tensor:
         """Return the states [N · K, S] that go with :meth:`seen`."""

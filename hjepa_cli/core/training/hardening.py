@@ -1,0 +1,36 @@
+"""An encoder that knows clean pictures learns to see the same in worse ones.
+
+A JEPA that is trained on worse pictures is less steady in clean ones too, and then predictors roll
+its embeddings out less far (docs/LOG.md). So it learns from clean pictures alone, and what it has
+learned is the teacher here: the encoder goes on from there, and its embedding of a worse picture is
+to be the teacher's of the clean one.
+"""
+
+import copy
+
+import torch
+from torch import Tensor, nn
+
+from hjepa_cli.core.training.batches import TrajectoryBatch
+from hjepa_cli.core.training.frame_policies import Phase
+from hjepa_cli.core.training.losses import cosine_loss
+
+
+class Hardening(Phase):
+    """It trains the ``encoder`` of ``networks`` on worse pictures; the others stay as they are."""
+
+    def __init__(self, networks: nn.ModuleDict, device: torch.device) -> None:
+        teacher = copy.deepcopy(networks["encoder"])
+        super().__init__(nn.ModuleDict({**networks, "teacher": teacher}), ("encoder",), device)
+
+    def train(self) -> None:
+        """Choose what learns; batch norms keep the statistics of clean pictures."""
+        super().train()
+        self.networks.eval()
+
+    def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
+        """Return 1 − cos(Ψ(worse), Ψ_teacher(clean)) of frames [B · F, κ, H, W, C]."""
+        with torch.no_grad():
+            target = self.networks["teacher"](batch.frames.to(self.device))
+        z = self.networks["encoder"](batch.seen.to(self.device))
+        return {"hardening": cosine_loss(z, target)}
