@@ -126,7 +126,7 @@ class CollectSettings:
     ] = 200
     test_trajectories: Annotated[Count, Flag("--test-trajectories", "Held-out trajectories.")] = 40
     clean_trajectories: Count = 40
-    steps: Annotated[CountFromTwo, Flag("--steps", "Control steps per trajectory.")] = 100
+    steps: Annotated[CountFromTwo, Flag("--steps", "Control steps per trajectory.")] = 160
     clean_steps: Count = 120
     # Initial states are uniform in ± these; none: the next four, a cart-pole's.
     start: tuple[NotNegative, ...] = ()
@@ -227,7 +227,7 @@ class AugmentSettings:
     steps: Count = 600
     learning_rate: NotNegative = 5e-4
     clean: Annotated[float, Meta(ge=0, le=1)] = 0.25  # share of pictures that stay as they are
-    share: Annotated[float, Meta(ge=0, le=1)] = 0.5  # of the others, for each effect by itself
+    share: Annotated[float, Meta(ge=0, le=1)] = 0.25  # of the others, for each effect by itself
     gain: BelowOne = 0.35  # ± of 1
     gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
     colour: BelowOne = 0.1  # ± of each channel
@@ -263,11 +263,11 @@ class HierarchySettings:
     m: Annotated[Count, Flag("--m", "Stride of the medium level, a multiple of l.")] = 2
     l: Annotated[Count, Flag("--l", "Stride of the low level.")] = 1
     # Of the pictures, sideways by up to encoder.shift_px, for actor and levels.
-    shifted_copies: CountOrNone = 4
-    rollout_steps: Count = 80
+    shifted_copies: CountOrNone = 2
+    rollout_steps: Count = 160  # as long as the gaps that models are to bear, and packets are late
     batch_trajectories: Count = 16
     coarse_starts: Count = 8
-    flat_starts: Count = 4
+    flat_starts: Count = 2
     fine_trajectories: Count = 80
     optimizer: Literal["adamw", "sgd"] = "adamw"
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
