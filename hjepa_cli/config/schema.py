@@ -136,6 +136,7 @@ class CollectSettings:
     theta_dot_rad_s: NotNegative = 5.0
     exploration_n: NotNegative = 4.0
     exploration_hold_steps: Count = 10
+    belief_steps: Count = 128  # that a tuned law is left with a wrong belief, at most
     frames: Annotated[
         Literal["rendered", "stored"],
         Flag("--frames", "Render camera frames when they are read, or store them with the states."),

@@ -12,8 +12,8 @@ from hjepa_cli.core.plants.named import plant
 
 STREAM = 1  # this stage's branch of the seed tree
 # Trajectories that a tuned law drives: how far from rest they start and how wrong the belief is
-# that it goes by, ÷ the half widths of other starts, and when a packet comes, ÷ their length.
-START, BELIEF, PACKET = 0.5, 0.3, (0.2, 0.8)
+# that it goes by, ÷ the half widths of other starts, and when a packet comes, ÷ belief_steps.
+START, BELIEF, PACKET = 0.5, 0.3, (0.25, 1.0)
 SPLITS = ("train", "test", "clean")
 
 
@@ -102,5 +102,5 @@ def _draw(
         return initial, np.zeros(shape), np.zeros_like(initial), 0
     pushes_n = random.normal(0.0, collect.exploration_n, (-(-steps // hold), *action))
     wrong = BELIEF * random.uniform(-1, 1, half_widths.size) * half_widths
-    packet = int(steps * random.uniform(*PACKET))
+    packet = int(collect.belief_steps * random.uniform(*PACKET))
     return initial, np.repeat(pushes_n, hold, axis=0)[:steps], wrong, packet
