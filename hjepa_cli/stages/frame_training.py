@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import EncoderSettings
+from hjepa_cli.config.schema import RECORDED, EncoderSettings
 from hjepa_cli.core.networks.model import UNSAID
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant_of
@@ -65,9 +65,13 @@ def fit(
         gradient_clip=options.gradient_clip,
         ranks=ranks,
     )
+    longest = train.actions.shape[1]
+    if run.settings.plant != RECORDED:
+        # Simulated motion is widest at its beginning; windows from anywhere would hardly show it.
+        longest = min(longest, options.batch_frames * options.h)
     windows = FrameWindows(
-        train.frames,
-        train.actions,
+        train.frames[:, : longest + 1],
+        train.actions[:, :longest],
         window_frames=options.batch_frames,
         stride=options.h,
         mirror=options.mirror == "augment",
@@ -81,7 +85,7 @@ def fit(
     share, device = ranks.share(count), resolve_device(run.settings.device)
     augment = Augmentation(run.settings.augment)
     part = (share.stop - share.start) / count  # 1 on a single process
-    epoch_steps = max(train.actions.shape[:2].numel() // (count * windows.window_frames), 1)
+    epoch_steps = max(windows.actions.shape[:2].numel() // (count * windows.window_frames), 1)
     terms: dict[str, Tensor] = {}
 
     def draw() -> Drawn:
