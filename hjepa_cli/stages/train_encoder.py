@@ -21,7 +21,6 @@ from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import tensors_of
 from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.plants.named import plant_of
-from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
 from hjepa_cli.core.training.optimiser import fit_actor
 from hjepa_cli.core.training.ranks import joined
@@ -200,25 +199,13 @@ def train_jepa(
         seed=settings.seed,
     )
 
-    augment, terms_of_all = settings.augment, [*jepa.weights]
-    if augment.strength:
-        terms_of_all.append("hardening")
-
     def watch(terms: dict[str, float]) -> dict[str, Any]:
         few, every = train[:WATCHED], math.gcd(4, options.h)
         report = examine(encoder, companion, few, test, settings, every=every)
-        losses = {f"loss_{name}": terms.get(name) for name in terms_of_all}
-        return losses | dotted(report, "_")
+        return {f"loss_{name}": value for name, value in terms.items()} | dotted(report, "_")
 
     fit(run, calm, "jepa", jepa, watch, augmented=False)
     encoder.eval()
-    if augment.strength:
-        hardening = Hardening(modules, resolve_device(settings.device))
-        fit(
-            *(run, train, "hardening", hardening, watch),
-            steps=augment.steps,
-            learning_rate=augment.learning_rate,
-        )
     if not ranks.leads:
         return {}
     run.screen.say("measuring health on all frames and fitting the probe actor")

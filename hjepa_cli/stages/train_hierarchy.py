@@ -3,10 +3,12 @@
 ``--h 4`` alone trains one level of that stride, ts-jepa-1 and the actor.
 
 Dataset + encoder checkpoint → one checkpoint with everything inference needs. The encoder is
-frozen: every frame is encoded once, and all that follows are small networks on embeddings.
+frozen: every frame is encoded once, and all that follows are small networks on embeddings. At the
+end it is hardened against worse pictures than it has seen.
 """
 
 import copy
+import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,15 +18,18 @@ import torch
 from numpy.random import Generator
 from torch import Tensor, nn
 
+from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.checks import check_strides
 from hjepa_cli.config.schema import HierarchySettings, Settings
 from hjepa_cli.core.control.drivers import methods_of
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import LEVELS, UNSAID, levels_of, load_modules
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training import levels
+from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, name_samples
 from hjepa_cli.core.training.rendered import RenderedSplit
@@ -43,6 +48,7 @@ from hjepa_cli.stages.embedding_training import (
     round_weights,
     save,
 )
+from hjepa_cli.stages.frame_training import fit as fit_on_frames
 from hjepa_cli.stages.inputs import (
     brought_along,
     check_same_plant,
@@ -155,10 +161,12 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
         labels = torch.cat([labels.flatten(0, 1) for _, labels in seen])
         fit_actor_to(modules, "actor", join(views).z.flatten(0, 1), labels, architecture, settings)
     train_levels(run, modules, architecture, views, shared)
-
+    examined, h = source.metadata["health"], architecture["h"]
+    if settings.augment.strength and begun["kind"] == "encoder":  # others are hard already
+        harden(run, modules, train)
+        examined = examined | {"probe_r2": probe_r2(modules, train, test, settings)}
     round_weights(modules)
-    h = architecture["h"]
-    examined = source.metadata["health"] | examine(modules, test, h, settings)
+    examined = examined | examine(modules, test, h, settings)
     model = save(run, modules, run.metadata(architecture, encoder=source.digest, health=examined))
     [method, *_] = methods_of(model)
     result = run.finish(
@@ -171,6 +179,33 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     show_hierarchy(result, screen)
     screen.say(f"model {result['checkpoint']} in {result['seconds']:.0f} s; next: hjepa eval")
     return result
+
+
+def harden(run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit) -> None:
+    """Train the encoder on worse pictures, so that it sees in them what it saw in clean ones."""
+    augment, encoder = run.settings.augment, modules["encoder"]
+    assert isinstance(encoder, Encoder)
+    frames, frame_gap = encoder.look
+    options = dataclasses.replace(run.settings.encoder, frames=frames, frame_gap=frame_gap)
+    fit_on_frames(
+        dataclasses.replace(run, settings=dataclasses.replace(run.settings, encoder=options)),
+        train,
+        "hardening",
+        Hardening(modules, resolve_device(run.settings.device)),
+        lambda terms: {"level": "hardening", "loss": terms["hardening"]},
+        steps=augment.steps,
+        learning_rate=augment.learning_rate,
+    )
+    encoder.requires_grad_(False)
+
+
+def probe_r2(
+    modules: nn.ModuleDict, train: RenderedSplit, test: RenderedSplit, settings: Settings
+) -> dict[str, float]:
+    """Return R² of the linear probes of the states, on every fourth frame."""
+    z = (embed(modules["encoder"], of, settings, every=4).flatten(0, 1) for of in (train, test))
+    (train_z, test_z), names = z, plant_of(settings).state_names
+    return health.probe_r2(train_z, train.states_at(4), test_z, test.states_at(4), names)
 
 
 def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) -> Checkpoint:

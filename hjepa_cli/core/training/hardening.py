@@ -1,9 +1,10 @@
 """An encoder that knows clean pictures learns to see the same in worse ones.
 
-A JEPA that is trained on worse pictures is less steady in clean ones too, and then predictors roll
-its embeddings out less far (docs/LOG.md). So it learns from clean pictures alone, and what it has
-learned is the teacher here: the encoder goes on from there, and its embedding of a worse picture is
-to be the teacher's of the clean one.
+It comes last, when actor and levels are there. A JEPA that is trained on worse pictures is less
+steady in clean ones too, and so is a hardened encoder: what learns from their embeddings rolls them
+out less far (docs/LOG.md). So all of it learns from the encoder of clean pictures. That one is the
+teacher here: the encoder goes on from it, and its embedding of a worse picture is to be the
+teacher's of the clean one.
 """
 
 import copy
