@@ -139,7 +139,7 @@ def fit_network(
 
     def report(step: int, loss: float) -> None:
         if step % REPORT_EVERY == 0 or step == optimiser.steps:
-            run.record.metric({"level": phase, "step": step, "loss": loss})
+            run.record.metric({"step": step, "level": phase, "loss": loss})
 
     modules[name].train()
     run.fit(phase, optimiser, {"modules": modules}, stream, draw, report)
