@@ -420,6 +420,14 @@ UNSAID: dict[str, Any] = {
     "encoder.frame_gap": 1,
     "conditions.stress": "",
 }
+# Some of it, and two sections of which nothing is stored either, are on by default, or tuned.
+TURNED_OFF: dict[str, Any] = {
+    "encoder.photometric": "none",
+    "augment.strength": 0.0,
+    "control.gains_n": [],
+    "control.ceiling_gains_n": [],
+}
+OFF = UNSAID | TURNED_OFF
 
 # What --protocol paper sets over these: scored from the start on.
 PAPER_PROTOCOL = {"warmup_steps": 0, "steps": 1000, "bracket_devices": 256}
@@ -758,6 +766,8 @@ class Settings:
         digests of settings stay what they were before there were such settings.
         """
         values = _without_empty(plain(dataclasses.asdict(self)))
+        if complete:  # also that there is no law: else that is what the plant's tuned one is
+            values["control"] = plain(dataclasses.asdict(self.control))
         usual = {
             "augment": not self.augment.strength,
             "camera": self.camera == CameraSettings(),
@@ -840,6 +850,35 @@ def dotted(values: Mapping[str, Any], separator: str = ".") -> dict[str, Any]:
         else:
             flat[key] = value
     return flat
+
+
+def unsaid(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a record of settings leaves out because it is off, by dotted key."""
+    said = dotted(recorded)
+    return {key: value for key, value in OFF.items() if key not in said}
+
+
+def spelled_out(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with what was turned off, as a file must say it that defaults lie below."""
+    values = {key: dict(of) if isinstance(of, Mapping) else of for key, of in recorded.items()}
+    missing = unsaid(recorded)
+    for key, off in TURNED_OFF.items():
+        if key in missing:
+            section, _, name = key.partition(".")
+            values.setdefault(section, {})[name] = off
+    return values
+
+
+def left_unsaid(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the record that :func:`spelled_out` was given."""
+    record = dict(values)
+    for key, off in TURNED_OFF.items():
+        section, _, name = key.partition(".")
+        if isinstance(of := record.get(section), Mapping) and of.get(name) == off:
+            record[section] = {other: of[other] for other in of if other != name}
+            if not record[section]:
+                del record[section]
+    return record
 
 
 def plain(value: Any) -> Any:

@@ -18,7 +18,7 @@ from hjepa_cli.compute import memory
 from hjepa_cli.compute.executors import MAX_WORKERS, cores, finished, open_executor
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.config.checks import check_settings
-from hjepa_cli.config.schema import RECORDED, Settings, dotted
+from hjepa_cli.config.schema import RECORDED, Settings, dotted, unsaid
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import (
     MANIFEST,
@@ -213,7 +213,7 @@ def recorded_settings(directory: Path) -> Settings:
     if preset is not None and not isinstance(preset, str):
         raise DataError(f"{directory} is of preset {preset!r}")
     try:
-        settings = load_settings(preset, None, dotted(task))
+        settings = load_settings(preset, None, unsaid(task) | dotted(task))
         check_settings(settings)
     except UsageError as error:
         raise DataError(

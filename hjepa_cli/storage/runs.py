@@ -25,7 +25,7 @@ import msgspec
 from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.compute.versions import TRAINED_WITH, versions
-from hjepa_cli.config.schema import Settings, dotted
+from hjepa_cli.config.schema import OFF, Settings, dotted, left_unsaid, spelled_out, unsaid
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.errors import (
     DataError,
@@ -236,7 +236,7 @@ class Run:
             "cpus": os.cpu_count(),
         }
         files.write_json(self.path(ENVIRONMENT), environment)
-        files.write_text(self.path(CONFIG), to_toml(settings))
+        files.write_text(self.path(CONFIG), to_toml(spelled_out(settings)))
         self.event("started")
 
     def _append(self, name: str, text: str) -> None:
@@ -336,7 +336,7 @@ def read_config(directory: Path) -> dict[str, Any]:
     path = directory / CONFIG
     try:
         text = files.read_bytes(path, limit=files.JSON_LIMIT_BYTES).decode("utf-8-sig")
-        found = tomllib.loads(text)
+        found = left_unsaid(tomllib.loads(text))
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid TOML: {error}") from None
     if (directory / ENVIRONMENT).exists():
@@ -488,14 +488,15 @@ def check_ours(directory: Path) -> None:
 
 
 def load_recorded(preset: object, directory: Path) -> Settings:
-    """Load the settings of a run; what its version had not is as its preset says.
+    """Load the settings of a run; what its version had not is as its preset says, or off.
 
     Before there was a warm-up, loops were scored from the start. Errors are those of
     :func:`~hjepa_cli.config.settings.load_settings`.
     """
-    protocol = read_config(directory).get("protocol", {})
-    scored_all = isinstance(protocol, Mapping) and "warmup_steps" not in protocol
-    flags = {"protocol.warmup_steps": 0} if scored_all else {}
+    recorded = read_config(directory)
+    flags = unsaid(recorded)
+    if "protocol.warmup_steps" not in dotted(recorded):
+        flags["protocol.warmup_steps"] = 0
     return load_settings(preset if isinstance(preset, str) else None, directory / CONFIG, flags)
 
 
@@ -503,8 +504,9 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Name the settings that differ, as ``section.key = old, not new``."""
     before, after = dotted(old), dotted(files.jsonable(new))
     if later := after.keys() - before.keys():  # settings that there were none of had their default
-        defaults = dotted(load_settings().as_dict())
+        defaults = dotted(load_settings().as_dict()) | OFF
         before |= {key: defaults[key] for key in later if key in defaults}
+    after |= {key: OFF[key] for key in (before.keys() & OFF.keys()) - after.keys()}
     return [
         f"{key} = {before.get(key)!r}, not {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys())

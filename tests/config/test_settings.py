@@ -12,8 +12,19 @@ import numpy as np
 import pytest
 
 from hjepa_cli.config.checks import check_settings, resolve
-from hjepa_cli.config.schema import PAPER_PROTOCOL, RadioSettings, Settings, declared, dotted
+from hjepa_cli.config.schema import (
+    OFF,
+    PAPER_PROTOCOL,
+    ControlSettings,
+    RadioSettings,
+    Settings,
+    declared,
+    dotted,
+    unsaid,
+)
 from hjepa_cli.config.settings import PRESETS, load_settings, origins
+from hjepa_cli.core.plants.control_law import ceiling_law, control_law
+from hjepa_cli.core.plants.named import plant as named
 from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.stages.train_encoder import ARCHITECTURE
 from hjepa_cli.storage.runs import to_toml
@@ -22,6 +33,10 @@ from hjepa_cli.storage.runs import to_toml
 def preset_file(name: str) -> dict[str, Any]:
     text = (resources.files("hjepa_cli.config") / f"presets/{name}.toml").read_text("utf-8")
     return tomllib.loads(text)
+
+
+def tuned_laws() -> dict[str, Any]:
+    return tomllib.loads((resources.files("hjepa_cli.config") / "control_laws.toml").read_text())
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -33,6 +48,14 @@ def test_every_preset_loads_and_says_what_it_is(preset: str) -> None:
     paper = {key: changes.pop(key) for key in list(changes) if key.startswith("protocol.paper.")}
     plain = Settings(plant=settings.plant).as_dict()  # which has more of a recorded one
     expected = dotted(plain) | changes | {"preset": preset}
+    if preset != "paper":  # which says that there is none
+        law = tuned_laws().get(settings.plant, {})
+        expected |= {f"control.{name}": gains for name, gains in law.items()}
+    for key, off in OFF.items():  # of what is off nothing is said
+        if expected.get(key) == off:
+            del expected[key]
+    if "augment.strength" not in expected:
+        expected = {key: value for key, value in expected.items() if "augment." not in key}
     assert dotted(settings.as_dict()) == expected
     # The paper's protocol sets its own values over the preset's, and no others.
     expected |= {f"protocol.{key}": value for key, value in PAPER_PROTOCOL.items()}
@@ -65,6 +88,42 @@ def test_a_protocol_lies_between_preset_and_file(tmp_path: Path) -> None:
         load_settings(config=config)
 
 
+def test_a_plant_comes_with_the_law_that_was_tuned_for_it(tmp_path: Path) -> None:
+    """Under whatever preset, but for those that say otherwise; a file may say so too."""
+    laws = tuned_laws()
+    assert set(laws) == {"desktop", "gym"}
+    for plant, law in laws.items():
+        for preset in (None, "smoke", "default"):
+            control = load_settings(preset, flags={"plant": plant}).control
+            assert list(control.gains_n) == law["gains_n"], (plant, preset)
+            assert list(control.ceiling_gains_n) == law["ceiling_gains_n"], (plant, preset)
+            control_law(named(plant), control)  # which refuses one that does not hold it
+            ceiling_law(named(plant), control)
+    assert origins()["control.gains_n"] == "tuned law of desktop"
+    for settings in (load_settings("paper"), load_settings(flags={"plant": "quadrotor"})):
+        assert settings.control == ControlSettings()
+    config = tmp_path / "c.toml"
+    config.write_text("[control]\ngains_n = []\n")
+    own = load_settings(config=config).control
+    assert own.gains_n == () and list(own.ceiling_gains_n) == laws["desktop"]["ceiling_gains_n"]
+
+
+def test_what_a_record_does_not_say_was_off() -> None:
+    """It is not what is on by default, or was tuned, by now."""
+    flags = {"encoder.photometric": "none", "augment.strength": 0.0, "control.gains_n": ()}
+    flags["control.ceiling_gains_n"] = ()
+    settings = load_settings(flags=flags)
+    said = dotted(settings.as_dict())
+    assert not said.keys() & OFF.keys()
+    recorded = {key: value for key, value in said.items() if key != "preset"}
+    assert load_settings(flags=unsaid(settings.as_dict()) | recorded) == settings
+    assert load_settings(flags=recorded) != settings
+    on = load_settings(flags={"protocol.delay_steps": 2, "augment.strength": 0.5})
+    kept = {"protocol.delay_steps", "augment.strength", "encoder.photometric"}
+    kept |= {"control.gains_n", "control.ceiling_gains_n"}
+    assert unsaid(on.as_dict()) == {key: off for key, off in OFF.items() if key not in kept}
+
+
 def test_the_defaults_are_those_of_the_papers() -> None:
     """Values that the papers state: those of TS-JEPA's simulation and of the hierarchy."""
     settings = load_settings()
@@ -91,8 +150,10 @@ def test_precedence(tmp_path: Path) -> None:
 
 def test_loading_twice_is_independent() -> None:
     load_settings("paper", flags={"collect.steps": 7})
-    assert load_settings() == load_settings(None) == load_settings("default") == Settings()
-    assert load_settings().collect.steps == 100
+    law = ControlSettings(**{name: tuple(of) for name, of in tuned_laws()["desktop"].items()})
+    expected = Settings(control=law)
+    assert load_settings() == load_settings(None) == load_settings("default") == expected
+    assert load_settings().collect.steps == 160
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def test_config_reproduces_the_settings(preset: str) -> None:
     with Run.create("eval", Path("out"), settings):
         pass
     again = load_settings(config=Path("out/config.toml")).as_dict()
-    assert again | {"preset": preset} == settings
+    assert again | {"preset": preset} == settings  # also what is off there, and on by default
     assert read_config(Path("out")) == {key: settings[key] for key in settings if key != "preset"}
 
 
