@@ -42,9 +42,7 @@ def _method(kind: str, frames: int, style: Style, does: str) -> Method:
         offered=lambda architecture, plant: (
             (architecture["kind"], architecture.get("frames")) == (kind, frames)
         ),
-        trained_by=training(
-            f"train-encoder --method {kind}" + (f" --frames {frames}" if frames != 2 else "")
-        ),
+        trained_by=training(f"train-encoder --method {kind} --frames {frames}"),
         compared=True,
         style=style,
         does=f"sends {frames} raw pictures {does}",
