@@ -86,11 +86,11 @@ def missing_curves(model: ZooModel) -> list[str]:
     from hjepa_cli.core.control.drivers import methods_of
     from hjepa_cli.core.evaluation import curves
     from hjepa_cli.core.networks.model import Model
-    from hjepa_cli.stages.model_set import ModelSet
+    from hjepa_cli.stages.model_set import ModelSet, under_law_of
 
     plant = model.metadata.get("plant")
-    settings = load_settings(plant if plant in PRESETS else None)
     held = Model.load(model.path)
+    settings = under_law_of(held, load_settings(plant if plant in PRESETS else None))
     models = ModelSet(settings, held, model.path, None)
     offered = methods_of(held)
     wanted = settings.methods if "hjepa" in offered else offered[:1]

@@ -58,6 +58,8 @@ PIXELS = ("hjepa", "ts-jepa-1", "ts-jepa-4", "hold", "zero")
 DESKTOP = plant("desktop")
 TRUE_STATE = without_model()
 INT8 = Integers(256, 8)
+BY_TEACHER = {"control.gains_n": []}
+NO_LAW = {**BY_TEACHER, "control.ceiling_gains_n": []}
 
 
 def small(
@@ -65,7 +67,7 @@ def small(
 ) -> Settings:
     """All of the protocol, in a few seconds."""
     flags = {"seed": seed, "methods": methods, "control.ceiling_gains_n": [-60, -35, -110, -8]}
-    settings = load_settings("smoke", flags=flags)
+    settings = load_settings("smoke", flags=flags | BY_TEACHER)
     tiny = {
         "warmup_steps": 0,
         "steps": 24,
@@ -85,7 +87,7 @@ def small(
 
 def untrained(path: Path, plant_name: str = "desktop", h: int = 4, seed: int = 0) -> Path:
     """A checkpoint of random networks, as train-hierarchy writes it."""
-    settings = load_settings(flags={"encoder.hidden": 32})
+    settings = load_settings(flags={"encoder.hidden": 32, "encoder.frames": 2, **NO_LAW})
     architecture = describe_architecture(settings) | {
         "kind": "hierarchy",
         "h": h,
@@ -343,7 +345,7 @@ def test_methods_without_a_model_are_skipped_with_the_command_that_trains_them(
     assert list(result["methods"]) == ["hold-true"]
     assert result["skipped"] == {
         "ts-jepa-5": "hjepa train-hierarchy --preset smoke --h 5",
-        "autoencoder-2": "hjepa train-encoder --method autoencoder --preset smoke",
+        "autoencoder-2": "hjepa train-encoder --method autoencoder --frames 2 --preset smoke",
     }
     assert "ts-jepa-5 skipped" in output.text
     assert "autoencoder-2 skipped" in output.text
@@ -883,7 +885,7 @@ def test_embedding_methods_start_with_the_actor_s_force(checkpoint: Path) -> Non
 
 
 def rollouts(steps: int) -> tuple[np.ndarray, np.ndarray]:
-    settings = load_settings()
+    settings = load_settings(flags=BY_TEACHER)
     settings = dataclasses.replace(
         settings,
         collect=dataclasses.replace(settings.collect, clean_trajectories=5, clean_steps=steps),
@@ -968,7 +970,7 @@ def test_oracle_and_optimal_make_no_error_on_clean_rollouts() -> None:
     ],
 )
 def test_ceilings_of_the_protocol(preset: str, expected: dict[str, Any]) -> None:
-    settings = load_settings(preset, flags={"protocol": "paper"})
+    settings = load_settings(preset, flags={"protocol": "paper", **BY_TEACHER})
     bench = Bench(settings.protocol, settings.seed, Simulator(settings, None))
     assert bench.teacher_score >= measuring.MIN_TEACHER_SCORE
     assert bench.teacher_score == pytest.approx(expected.pop("teacher"), abs=0.035)

@@ -44,6 +44,9 @@ def settings() -> Settings:
         "protocol.curve_devices": DEVICES,
         "encoder.precision": "fp32",
         "encoder.hidden": 32,
+        "encoder.frames": 2,
+        "encoder.photometric": "none",
+        "control.gains_n": [],
     }
     return load_settings(flags=flags)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_evaluate import Output, checkpoint, elsewhere, quick_encoder, small, untrained
+from test_evaluate import NO_LAW, Output, checkpoint, elsewhere, quick_encoder, small, untrained
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import load_settings
@@ -50,7 +50,8 @@ def saved(path: Path, settings: Settings, **architecture: Any) -> Path:
 
 def of_method(method: str, frames: int = 2, **flags: Any) -> Settings:
     given = {"encoder.method": method, "encoder.frames": frames, "encoder.hidden": 16}
-    return load_settings(flags=given | {key.replace("__", "."): v for key, v in flags.items()})
+    given |= NO_LAW | {key.replace("__", "."): v for key, v in flags.items()}
+    return load_settings(flags=given)
 
 
 def trained(stage: str, settings: Settings, **architecture: Any) -> Path:
@@ -101,7 +102,9 @@ def test_every_method_finds_its_model(tmp_path: Path, quick_encoder: None) -> No
 
 def test_a_figure_shows_models_of_one_training_seed(quick_encoder: None) -> None:
     pytest.importorskip("matplotlib")
-    trained("train-hierarchy", load_settings(flags={"encoder.hidden": 16}), kind="hierarchy")
+    trained(
+        "train-hierarchy", load_settings(flags={"encoder.hidden": 16, **NO_LAW}), kind="hierarchy"
+    )
     other = trained("train-encoder", of_method("supervised", seed=3))
     options = small(methods=("zero", "supervised-2", "oracle"), steps=6)
     result = evaluate.run(options, Output().screen)  # a table says which model is whose
@@ -130,7 +133,7 @@ def test_one_level_comes_after_a_hierarchy_and_before_the_zoo(tmp_path: Path) ->
     assert open_model_set(options, screen, None, None).path == shipped
     lonely = flat(2)
     assert open_model_set(options, screen, None, None).path == lonely
-    settings = load_settings(flags={"encoder.hidden": 16})
+    settings = load_settings(flags={"encoder.hidden": 16, **NO_LAW})
     several = trained("train-hierarchy", settings, kind="hierarchy", h=4, m=2, l=1)
     flat(3)
     assert open_model_set(options, screen, None, None).path == several
@@ -253,9 +256,9 @@ def test_closed_forms_are_measured_like_any_method(checkpoint: Path, quick_encod
 @pytest.mark.parametrize(
     ("method", "flags", "command"),
     [
-        ("supervised-2", {}, "hjepa train-encoder --method supervised"),
+        ("supervised-2", {}, "hjepa train-encoder --method supervised --frames 2"),
         ("supervised-4", {}, "hjepa train-encoder --method supervised --frames 4"),
-        ("autoencoder-2", {}, "hjepa train-encoder --method autoencoder"),
+        ("autoencoder-2", {}, "hjepa train-encoder --method autoencoder --frames 2"),
         ("ts-jepa-3", {}, "hjepa train-hierarchy --h 3"),
         ("ts-jepa-1", {}, "hjepa train-hierarchy"),
         ("linear", {}, "hjepa train-hierarchy"),

@@ -311,6 +311,7 @@ def test_real_curves_of_the_true_state_methods(tmp_path, monkeypatch):
         "smoke",
         flags={
             "methods": ("hold-true", "optimal"),
+            "control.gains_n": [],
             "radio.snr_db": "20:20",
             "protocol": "paper",
             "protocol.steps": 120,

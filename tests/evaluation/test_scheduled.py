@@ -30,6 +30,7 @@ SMALL = {
     "protocol.steps": 150,
     "protocol.bracket": 0.2,
     "protocol.bootstrap": 200,
+    "control.gains_n": [],
 }
 
 

@@ -25,6 +25,7 @@ SETTINGS = {
     "survival.loops": 24,
     "survival.splitting_paths": 0,
     "methods": ("oracle", "hold-true"),
+    "control.gains_n": [],
 }
 
 
