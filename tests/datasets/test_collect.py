@@ -3,24 +3,28 @@
 import dataclasses
 import io
 import json
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import load_dataset
-from hjepa_cli.core.datasets.trajectories import generate
+from hjepa_cli.core.datasets.trajectories import driven_by_teacher, generate, split_sizes
 from hjepa_cli.core.plants.named import Camera, plant, teacher
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, StorageError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import collect
+from hjepa_cli.stages.inputs import brought_along
 
 PRESETS = ("default", "gym")
 
 
-def settings_of(preset="default", seed=0, **changes):
-    settings = load_settings(preset, flags={"seed": seed})
-    small = {"trajectories": 6, "test_trajectories": 2, "clean_trajectories": 2} | changes
+def settings_of(preset="default", seed=0, law=(), **changes):
+    """Settings of a few trajectories, all by the plant's own teacher, unless a law is given."""
+    settings = load_settings(preset, flags={"seed": seed, "control.gains_n": law})
+    small = {"trajectories": 6, "test_trajectories": 2, "clean_trajectories": 2, "steps": 100}
+    small |= changes
     return dataclasses.replace(settings, collect=dataclasses.replace(settings.collect, **small))
 
 
@@ -92,6 +96,67 @@ def test_a_trajectory_depends_on_its_seed_split_and_index_only():
         for seed, split, index in streams
     ]
     assert len(set(starts)) == 4
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_tuned_law_drives_as_many_in_training_as_the_teacher(preset):
+    """Every second trajectory is the teacher's, and what the teacher does does not depend on it."""
+    law = load_settings(preset).control.gains_n
+    assert law, "the plant's, by default"
+    both, alone = settings_of(preset, law=law), settings_of(preset)
+    assert split_sizes(both) == {"train": (12, 100), "test": (2, 100), "clean": (2, 120)}
+    assert split_sizes(alone) == {"train": (6, 100), "test": (2, 100), "clean": (2, 120)}
+    assert split_sizes(load_settings("paper"))["train"] == (200, 100)
+    assert split_sizes(load_settings(preset))["train"] == (400, load_settings(preset).collect.steps)
+    data, of_teacher = generate(both, "train"), driven_by_teacher(both)
+    assert len(data) == 12 and len(data[of_teacher]) == 6
+    assert len(generate(alone, "train")[driven_by_teacher(alone)]) == 6
+    # The law and the teacher see the same state and do not do the same; one of them drove.
+    quiet = dataclasses.replace(both, collect=dataclasses.replace(both.collect, exploration_n=0.0))
+    data, act = generate(quiet, "train"), teacher(quiet.plant)
+    by_teacher_n = act(data.states[:, 1:].astype(float))
+    np.testing.assert_allclose(
+        data.applied_n[of_teacher], by_teacher_n[of_teacher], rtol=0, atol=2e-3
+    )
+    others = np.setdiff1d(np.arange(12), np.arange(12)[of_teacher])
+    assert (np.abs(data.applied_n - by_teacher_n)[others].max(axis=1) > 1.0).all()
+
+
+@pytest.mark.parametrize(("law", "count"), [((), 6), (load_settings().control.gains_n, 12)])
+def test_a_plan_and_a_dataset_count_both_laws(tmp_path, screen, law, count):
+    settings = settings_of(law=law, steps=10, clean_steps=5)
+    planned = collect.plan(settings)
+    steps = count * 10 + 2 * 10 + 2 * 5
+    assert f"simulate {count} training, 2 held-out and 2 clean trajectories" in planned.work[0]
+    assert f"({steps} steps)" in planned.work[0]
+    assert collect.size_bytes(settings) == 4 * (steps * (4 + 2) + (count + 4) * 4)
+    result = collect.run(settings, screen, out=tmp_path / "data")
+    assert result["trajectories"] == count
+    data = load_dataset(tmp_path / "data", "desktop")
+    assert data.settings.get("control", {}).get("gains_n", []) == list(law)
+    assert len(data.split("train")) == count
+    known = brought_along(load_settings(), data.settings, data.path)
+    assert len(data.split("train")[driven_by_teacher(known)]) == 6, "as the dataset says"
+
+
+@pytest.mark.parametrize("law", [(), load_settings().control.gains_n])
+def test_an_interrupted_collection_goes_on_under_its_own_law(tmp_path, screen, law, monkeypatch):
+    """Also where that is the teacher, which its record does not mention."""
+    settings, out = settings_of(law=law, steps=10), tmp_path / "data"
+    whole = collect.run(settings, screen, out=tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        patched.setattr(collect, "write_shard", Mock(side_effect=StorageError("full")))
+        with pytest.raises(StorageError, match="full"):
+            collect.run(settings, screen, out=out)
+    assert collect.recorded_settings(out).control == settings.control
+    other = settings_of(law=() if law else load_settings().control.gains_n, steps=10)
+    with pytest.raises(UsageError, match=r"other settings: control\.gains_n = "):
+        collect.run(other, screen, out=out)
+    again = collect.run(settings, screen, out=out)
+    assert again["trajectories"] == whole["trajectories"]
+    names = sorted(path.name for path in out.iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "whole").iterdir())
+    assert all((out / of).read_bytes() == (tmp_path / "whole" / of).read_bytes() for of in names)
 
 
 @pytest.mark.parametrize("frames", ["rendered", "stored"])

@@ -37,7 +37,8 @@ SCREEN = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
 def small(**changes: Any) -> Settings:
     flags = {"trajectories": 5, "test_trajectories": 1, "clean_trajectories": 1, "steps": 8}
     flags |= {"clean_steps": 8} | changes
-    return load_settings(flags={f"collect.{key}": value for key, value in flags.items()})
+    counted = {f"collect.{key}": value for key, value in flags.items()}
+    return load_settings(flags=counted | {"control.gains_n": []})  # by the teacher alone
 
 
 @pytest.fixture(autouse=True)

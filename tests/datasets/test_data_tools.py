@@ -18,6 +18,7 @@ from hjepa_cli.core.plants.named import Camera, CartPole, teacher
 
 COLUMNS = {"action", "ep_len", "ep_offset", "pixels", "state", "teacher_action"}
 SIZES = "[collect]\ntrajectories = 3\ntest_trajectories = 2\nclean_trajectories = 2\nsteps = 11\n"
+SIZES += "[control]\ngains_n = []\n"  # the teacher's labels, and no other trajectories than its own
 
 
 @pytest.fixture
@@ -250,11 +251,13 @@ def test_config_show_of_a_section_or_value(shell):
     assert_one_line_error(shell("config", "show", "rad"), 2, "'rad'", "radio")
 
 
-def test_config_show_toml_is_a_complete_config_file(shell):
-    text = shell("config", "show", "--toml", "--preset", "gym", "--seed", "4").out
+@pytest.mark.parametrize("preset", ["gym", "paper"])
+def test_config_show_toml_is_a_complete_config_file(shell, preset):
+    """Also of what is off in the preset and on by default: a tuned law, worse pictures."""
+    text = shell("config", "show", "--toml", "--preset", preset, "--seed", "4").out
     Path("c.toml").write_text(text)
-    settings = load_settings(config=Path("c.toml")).as_dict() | {"preset": "gym"}
-    assert settings == load_settings("gym", flags={"seed": 4}).as_dict()
+    settings = load_settings(config=Path("c.toml")).as_dict() | {"preset": preset}
+    assert settings == load_settings(preset, flags={"seed": 4}).as_dict()
     assert tomllib.loads(text)["seed"] == 4
 
 

@@ -392,8 +392,10 @@ def test_arrays_from_python(tmp_path, monkeypatch):
 def test_training_on_our_own_data_imported_again_is_the_same_training(shell, tmp_path):
     """Bit for bit, where pictures are not moved: of recordings nobody knows what that means."""
     few = ("--trajectories", 12, "--test-trajectories", 4, "--steps", 20)
-    (tmp_path / "c.toml").write_text("[encoder]\nshift_px = 0\nsteps = 2\n")
-    assert shell("collect", "--preset", "smoke", *few, "--out", "own").code == 0
+    text = "[encoder]\nshift_px = 0\nsteps = 2\n[control]\ngains_n = []\n"  # which no recording has
+    (tmp_path / "c.toml").write_text(text)
+    collected = ("collect", "--preset", "smoke", "--config", "c.toml", *few, "--out", "own")
+    assert shell(*collected).code == 0
     for split in ("train", "test"):
         assert shell("data", "export", "own", "--split", split, "--out", f"{split}.npz").code == 0
     mirrored = ("--mirror-signs", "-1", "--test", "test.npz", "--out", "again")

@@ -192,9 +192,8 @@ def test_shifted_copies_are_embedded_and_labelled_where_they_are(recorded: Traje
     split = dataclasses.replace(
         split, labels=torch.from_numpy(plant("desktop").teacher()(in_view[:, 1:]) / LIMIT_N)
     )
-    settings = load_settings(
-        flags={"device": "cpu", "hierarchy.shifted_copies": 3, "encoder.shift_px": 3}
-    )
+    flags = {"device": "cpu", "hierarchy.shifted_copies": 3, "encoder.shift_px": 3}
+    settings = load_settings(flags=flags | {"control.gains_n": []})  # labels are the teacher's
 
     class Last(nn.Module):
         def forward(self, frames: Tensor) -> Tensor:

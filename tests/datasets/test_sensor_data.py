@@ -100,7 +100,8 @@ def test_a_model_s_loops_take_pictures_as_it_was_trained(model, monkeypatch):
         assert under_law_of(model, settings).sensor == expected
         build_driver("local", settings, model).sensor(states)
         camera = camera_of(plant("desktop"), settings.camera, expected)
-        wanted = camera.render(states[:, -2:].reshape(-1, 4)).reshape(5, 2, 64, 128, 3)
+        shown = states[:, -model.frames :]
+        wanted = camera.render(shown.reshape(-1, 4)).reshape(5, -1, 64, 128, 3)
         np.testing.assert_array_equal(seen.pop(), wanted)
 
 
