@@ -52,7 +52,8 @@ def pieces(model: Model, devices: int) -> None:
     camera = Camera(kind)
     print(f"camera    {2 * devices / seconds(lambda: camera.render(states)):12,.0f} frames/s")
     for count in (1, devices, 256):
-        frames = np.random.default_rng(0).integers(0, 256, (count, 2, 64, 128, 3), np.uint8)
+        shape = (count, model.frames, 64, 128, 3)
+        frames = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
         each_ms = 1e3 * seconds(lambda frames=frames: model.encode(frames)) / count
         print(f"encoder   {each_ms:12.3f} ms per embedding in batches of {count}")
     macs = multiply_accumulates(lambda: model.encode(frames[:1]))

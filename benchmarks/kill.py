@@ -57,7 +57,7 @@ OF_DISK = (ModuleType, io.BufferedIOBase, io.FileIO)  # not locks, which have __
 COMPARED = ("*.safetensors", "dataset.json", METRICS, "curves.json", "devices.csv", "config.toml")
 SETTINGS = load_settings(
     flags={
-        "collect.trajectories": 6,
+        "collect.trajectories": 3,  # and as many by the tuned law
         "collect.test_trajectories": 2,
         "collect.clean_trajectories": 2,
         "collect.steps": 20,
@@ -68,6 +68,7 @@ SETTINGS = load_settings(
         "encoder.batch_trajectories": 6,
         "encoder.batch_frames": 5,
         "encoder.gate": False,
+        "augment.steps": 4,
         "actor.epochs": 1,
         "actor.batch": 40,
         "actor.hidden": 16,

@@ -50,7 +50,12 @@ from hjepa_cli.core.training.losses import InverseDynamics, rollout_loss
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.stages.train_encoder import describe_architecture
 
-TRAJECTORIES = 40
+FLAGS = {  # pairs of frames, as the usual loops draw them
+    "collect.trajectories": 40,
+    "control.gains_n": [],
+    "encoder.frames": 2,
+    "encoder.photometric": "none",
+}
 PLAIN_ITEMS = 20  # about as many frames per step as the other loops encode
 LEAST_RATIOS = {"plain": 5.0, "bare": 0.9}
 CPU = torch.device("cpu")
@@ -254,7 +259,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     rounds = parser.parse_args().rounds
     torch.manual_seed(0)
-    loops = build_loops(load_settings(flags={"collect.trajectories": TRAJECTORIES}))
+    loops = build_loops(load_settings(flags=FLAGS))
     took_s = time_in_turn(loops, rounds)
     print(f"{torch.get_num_threads()} threads; medians of {rounds} rounds, [min, max]")
     print("          predicted embeddings/s       encoded frames/s   hjepa ÷ it = sharing x speed")

@@ -120,20 +120,25 @@ def plan(
     )
     settings = brought_along(settings, data.settings, data.path) if data else settings
     find = partial(open_encoder, encoder, settings, Screen(quiet=True))
-    _, encoder_line = found("encoder", find, encoder, "hjepa train-encoder")
+    source, encoder_line = found("encoder", find, encoder, "hjepa train-encoder")
     architecture = describe_architecture(settings)
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))
     steps = sum(level_steps(architecture, settings.hierarchy).values())
     h, m, l = (architecture[name] for name in ("h", "m", "l"))
     several = architecture["kind"] == "hierarchy"
     named = f"P^H, P^M, P^L (h, m, l = {h}, {m}, {l})" if several else f"one level (h = {h})"
+    work = [embedding, f"train {named}, ts-jepa-1 and the actor ({steps} steps)"]
+    if settings.augment.strength and (source is None or is_soft(source)):
+        work.append(f"harden the encoder for {settings.augment.steps} steps on worse pictures")
+        batch = settings.encoder.batch_trajectories * settings.encoder.batch_frames
+        amounts["encoder training frames"] = settings.augment.steps * batch
     return plan_training(
         "train-hierarchy",
         settings,
         out,
         architecture,
         reads=[dataset_line, encoder_line],
-        work=[embedding, f"train {named}, ts-jepa-1 and the actor ({steps} steps)"],
+        work=work,
         amounts={**amounts, "level training steps": steps},
     )
 
@@ -162,7 +167,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
         fit_actor_to(modules, "actor", join(views).z.flatten(0, 1), labels, architecture, settings)
     train_levels(run, modules, architecture, views, shared)
     examined, h = source.metadata["health"], architecture["h"]
-    if settings.augment.strength and begun["kind"] == "encoder":  # others are hard already
+    if settings.augment.strength and is_soft(source):
         harden(run, modules, train)
         examined = examined | {"probe_r2": probe_r2(modules, train, test, settings)}
     round_weights(modules)
@@ -179,6 +184,11 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     show_hierarchy(result, screen)
     screen.say(f"model {result['checkpoint']} in {result['seconds']:.0f} s; next: hjepa eval")
     return result
+
+
+def is_soft(source: Checkpoint) -> bool:
+    """Return whether an encoder is to be hardened: those of other checkpoints are hard already."""
+    return bool(source.metadata["architecture"]["kind"] == "encoder")
 
 
 def harden(run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit) -> None:

@@ -373,10 +373,12 @@ def test_dry_run_follows_the_flags(shell):
         shell("collect", "--dry-run", "--json", *flags.split()).document["plan"]
         for flags in ("--trajectories 10", "--trajectories 1000", "--frames stored")
     )
-    assert "10 training" in small["work"][0] and "1000 training" in large["work"][0]
+    # By the teacher, and as many by the tuned law.
+    assert "simulate 20 training" in small["work"][0]
+    assert "simulate 2000 training" in large["work"][0]
     assert small["writes_bytes"] < large["writes_bytes"] < stored["writes_bytes"]
-    # 28,800 steps + 280 first frames, 64 x 128 x 3 bytes each
-    assert stored["writes_bytes"] == pytest.approx(29_080 * 24_576, rel=0.01)
+    # 75,200 steps + 480 first frames, 64 x 128 x 3 bytes each
+    assert stored["writes_bytes"] == pytest.approx(75_680 * 24_576, rel=0.01)
     named = shell("train-encoder", "--dry-run", "--out", "here").out
     assert "here" in named
 
@@ -387,18 +389,44 @@ def test_dry_run_promises_the_size_that_collect_needs(shell, preset):
     assert plan["writes_bytes"] == collect.size_bytes(load_settings(preset))
 
 
-@pytest.mark.parametrize(("preset", "passes"), [("default", 15), ("paper", 148)])
+@pytest.mark.parametrize(("preset", "passes"), [("default", 5), ("paper", 148)])
 def test_dry_run_counts_passes_over_the_training_frames(shell, preset, passes):
     plan = shell("train-encoder", "--dry-run", "--json", "--preset", preset).document["plan"]
     assert f"({passes} passes over the data)" in plan["work"][1]
 
 
+def test_dry_run_plans_to_harden_an_encoder_once(shell):
+    """The zoo's models are hard already."""
+    import numpy as np
+
+    from hjepa_cli.storage.checkpoints import save_checkpoint
+
+    def planned(*flags):
+        plan = shell("train-hierarchy", "--dry-run", "--json", *flags).document["plan"]
+        return [line for line in plan["work"] if "harden" in line], plan["seconds"]
+
+    Path("c.toml").write_text("[augment]\nstrength = 0.0\n")
+    encoder = Path("e.safetensors")
+    settings = load_settings()
+    metadata = {
+        "plant": "desktop",
+        "architecture": {"kind": "encoder", "h": 4, "m": 4, "l": 4},
+        "settings": settings.as_dict(),
+    }
+    save_checkpoint(encoder, {"w": np.zeros(1, np.float32)}, metadata)
+    lines, seconds = planned("--encoder", encoder)
+    assert lines == ["harden the encoder for 600 steps on worse pictures"]
+    off, quicker = planned("--encoder", encoder, "--config", "c.toml")
+    assert off == [] and quicker < seconds - 200
+    assert planned("--encoder", "desktop-h4m2l1")[0] == []
+
+
 @pytest.mark.parametrize(
     ("encoder", "times"),
     [
-        ("", ", those for training 5 times"),
+        ("", ", those for training 3 times"),
         ("shift_px = 0", ""),
-        ('mirror = "augment"', ", those for training 10 times"),
+        ('mirror = "augment"', ", those for training 6 times"),
         ('mirror = "augment"\nshift_px = 0', ", those for training 2 times"),
     ],
 )
@@ -665,7 +693,7 @@ def test_the_five_lines_from_pixels_to_device_counts(shell):
 
     collected = document("hjepa collect --trajectories 6")
     assert collected.keys() >= {"dataset", "test_trajectories", "seconds", "frames_per_s"}
-    assert (collected["trajectories"], collected["steps"]) == (6, load_settings().collect.steps)
+    assert (collected["trajectories"], collected["steps"]) == (12, 100)
     assert (Path(collected["dataset"]) / "dataset.json").is_file()
 
     encoder = document("hjepa train-encoder")

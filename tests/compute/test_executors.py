@@ -30,6 +30,7 @@ from hjepa_cli.storage.shards import LOG, Shard, ShardLog, cut
 SCREEN = Screen(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
 SETTINGS = load_settings(
     flags={
+        "control.gains_n": [],
         "collect.trajectories": 9,
         "collect.test_trajectories": 3,
         "collect.clean_trajectories": 2,
@@ -286,8 +287,8 @@ def test_places_that_are_not_there(hjepa: Shell, monkeypatch: pytest.MonkeyPatch
 
 def test_a_million_trajectories_are_planned(hjepa: Shell) -> None:
     plan = hjepa("collect", "--trajectories", "1000000", "--dry-run", "--json").document["plan"]
-    assert "in 1002 shards" in plan["writes"][0]
-    assert plan["writes_bytes"] == pytest.approx(1e6 * (101 * 16 + 800), rel=0.01)
+    assert "in 2002 shards" in plan["writes"][0]  # of both laws
+    assert plan["writes_bytes"] == pytest.approx(2e6 * (161 * 16 + 160 * 8), rel=0.01)
     assert 1 < plan["minutes"] < 60
     assert hjepa.files() == {}
 

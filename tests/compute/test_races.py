@@ -203,14 +203,14 @@ def test_ctrl_c_leaves_no_process_behind_and_the_command_goes_on(
         pytest.importorskip("distributed")
     shell: Shell = open_shell(tmp_path, monkeypatch, capsys)
     command = [sys.executable, "-m", "hjepa_cli", "collect", "--steps", "20", "--out", "data"]
-    command += ["--trajectories", "60000", *place]
+    command += ["--trajectories", "30000", *place]  # and as many by the tuned law
     with subprocess.Popen(
         command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as child:
         log = tmp_path / "data" / "collecting.jsonl"
         while child.poll() is None and (not log.exists() or log.read_bytes().count(b"\n") < 3):
             time.sleep(0.01)
-        second = shell("collect", "--trajectories", "60000", "--steps", "20", "--out", "data")
+        second = shell("collect", "--trajectories", "30000", "--steps", "20", "--out", "data")
         assert_one_line_error(second, 75, f"process {child.pid} on")
         os.killpg(child.pid, number)
         _, errors = child.communicate(timeout=60)

@@ -260,7 +260,8 @@ def test_a_reader_of_linear_embeddings_controls_as_well_as_the_teacher(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Embeddings that are the state in other coordinates: decoder, dynamics and filter are good."""
-    settings = load_settings(flags={"collect.trajectories": 40, "collect.test_trajectories": 10})
+    few = {"collect.trajectories": 40, "collect.test_trajectories": 10, "collect.steps": 100}
+    settings = load_settings(flags=few | {"control.gains_n": []})
     mix = torch.randn(4, 12, generator=torch.Generator().manual_seed(0))
 
     def embed(model: object, seen: np.ndarray) -> torch.Tensor:

@@ -31,7 +31,9 @@ class Seen:
         return normalise(columns.mean(-1).flatten(1) @ self.mix)
 
 
-SETTINGS = load_settings(flags={"collect.trajectories": 4, "collect.steps": 25})
+SETTINGS = load_settings(
+    flags={"collect.trajectories": 4, "collect.steps": 25, "control.gains_n": []}
+)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
 from hjepa_cli.core.plants.stress import under
+from hjepa_cli.stages.model_set import under_law_of
 
 
 def normal(count: int, seed: int) -> torch.Tensor:
@@ -99,7 +100,7 @@ def model():
 
 
 def measured(model, condition: str, **changes: float):
-    settings = load_settings(flags=SMALL | changes)
+    settings = under_law_of(model, load_settings(flags=SMALL | changes))
     simulator = Simulator(under(settings, condition), model)
     return Block("hjepa", (Point("gap", 20.0),), 0, 6).compute(simulator, lambda steps: None)
 

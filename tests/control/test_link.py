@@ -483,7 +483,7 @@ def test_late_packets_on_the_true_state() -> None:
 
 def settings(**changes: Any) -> Settings:
     options = protocol(**{"curve_devices": 3, "bracket_devices": 4, "bootstrap": 20, **changes})
-    return dataclasses.replace(load_settings(), protocol=options)
+    return dataclasses.replace(load_settings(flags={"control.gains_n": []}), protocol=options)
 
 
 def test_what_sits_on_the_device_has_no_link() -> None:

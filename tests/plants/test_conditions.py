@@ -1,5 +1,6 @@
 """Devices that differ from those of the training data."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -15,6 +16,7 @@ from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
 from hjepa_cli.core.plants.conditions import Disturbed, actual_camera, actual_plant, vary
+from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.errors import UsageError
@@ -29,7 +31,7 @@ STATES = np.array([[0.01, 0.2, 0.1, -0.3], [-0.02, 0.0, -0.2, 1.0]])
 
 def settings(preset: str = "default", seed: int = 0, **conditions: float) -> Settings:
     changes = {f"conditions.{name}": value for name, value in conditions.items()}
-    return load_settings(preset, flags={"seed": seed, **changes})
+    return load_settings(preset, flags={"seed": seed, "control.gains_n": [], **changes})
 
 
 def devices(options: Settings) -> System:
@@ -104,7 +106,9 @@ def test_a_controller_that_does_not_know_does_worse() -> None:
 
 def test_digests_are_those_of_before_unless_conditions_changed() -> None:
     shipped = json.loads((zoo_directory() / "desktop-h4m2l1" / "curves.json").read_text())["digest"]
-    assert Digest.of(shipped["checkpoint"], settings()).protocol == shipped["protocol"]
+    law = control_of(load_model("desktop-h4m2l1").metadata["settings"], "the zoo")
+    under_its_law = dataclasses.replace(load_settings(), control=law)
+    assert Digest.of(shipped["checkpoint"], under_its_law).protocol == shipped["protocol"]
     digests = {
         Digest.of(None, settings(**conditions)).protocol
         for conditions in ({}, {"light": 0.8}, {"camera_noise": 1.0}, {"pole_length": 0.9})

@@ -39,6 +39,8 @@ steps = 2
 gate = false
 batch_trajectories = 2
 batch_frames = 4
+[augment]
+steps = 2
 [actor]
 epochs = 1
 [hierarchy]

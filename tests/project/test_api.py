@@ -22,6 +22,7 @@ QUICK = {
     "protocol.steps": 40,
     "protocol.curve_devices": 4,
     "protocol.bracket_devices": 8,
+    "control.gains_n": [],
 }
 
 
@@ -221,6 +222,7 @@ def test_a_late_method_is_one_over_a_late_link(model):
 
 def test_stages_return_their_documents_and_print_nothing(capsys):
     small = {"collect.trajectories": 2, "collect.test_trajectories": 2, "collect.steps": 10}
+    small |= {"control.gains_n": []}
     data = hjepa_cli.collect(preset="smoke", settings=small, out="d")
     assert data.path == Path("d") and len(data.split("train")) == 2
     assert hjepa_cli.load_dataset("d").digest == data.digest

@@ -38,6 +38,9 @@ embedding = 64
 hidden = 256
 steps = 300
 batch_trajectories = 8
+photometric = "none"
+[augment]
+strength = 0.0
 [actor]
 hidden = 256
 epochs = 40

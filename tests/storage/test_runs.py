@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -108,6 +109,51 @@ def test_config_reproduces_the_settings(preset: str) -> None:
     again = load_settings(config=Path("out/config.toml")).as_dict()
     assert again | {"preset": preset} == settings  # also what is off there, and on by default
     assert read_config(Path("out")) == {key: settings[key] for key in settings if key != "preset"}
+
+
+OFF = {
+    "encoder.photometric": "none",
+    "augment.strength": 0.0,
+    "control.gains_n": [],
+    "control.ceiling_gains_n": [],
+}
+
+
+def test_what_was_turned_off_stays_off() -> None:
+    """Though it is on by default, or tuned, and settings say nothing of what is off."""
+    off = load_settings(flags=OFF).as_dict()
+    with Run.create("eval", Path("out"), off):
+        pass
+    with Run.create("eval", Path("out"), off) as run:
+        assert run.resumed
+    assert runs.load_recorded("default", Path("out")).as_dict() == off
+    said = [
+        r"augment\.strength = 0\.0, not 1\.0",
+        r"control\.gains_n = \[\], not \[-130",
+        r"encoder\.photometric = 'none', not 'affine'",
+    ]
+    with pytest.raises(UsageError, match=".*".join(said)):
+        Run.create("eval", Path("out"), SETTINGS)
+    with Run.create("eval", Path("other"), SETTINGS):
+        pass
+    with pytest.raises(UsageError, match=r"control\.gains_n = \[-130.*, not \[\]"):
+        Run.create("eval", Path("other"), off)
+
+
+def test_older_records_mean_off_where_they_say_nothing() -> None:
+    """There was no other light, no worse picture and no tuned law before there were settings."""
+    off = load_settings(flags=OFF)
+    with Run.create("eval", Path("out"), off.as_dict()):
+        pass
+    config = Path("out/config.toml")
+    text = re.sub(r'photometric = "none"\n', "", config.read_text())
+    text = re.sub(r"\n\[(augment|control)\]\n(\w+ = .*\n)+", "", text)
+    assert not re.search("photometric|strength|gains_n", text)
+    config.write_text(text)
+    as_of_schema(2, Path("out"))
+    assert runs.load_recorded("default", Path("out")) == off
+    with pytest.warns(Unsealed), Run.create("eval", Path("out"), off.as_dict()) as run:
+        assert run.resumed
 
 
 def test_toml_of_awkward_values() -> None:

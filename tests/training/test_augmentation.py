@@ -13,12 +13,13 @@ from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import TrajectoryBatch
+from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
 
 OFF = {
     field.name: 0.0
     for field in dataclasses.fields(AugmentSettings)
-    if field.name not in ("strength", "share", "copies")
+    if field.name not in ("strength", "steps", "learning_rate", "share")
 }
 COUNT = 400
 
@@ -43,11 +44,11 @@ def ramp(count: int = COUNT) -> torch.Tensor:
 def test_off_it_does_nothing_and_draws_nothing() -> None:
     stream = np.random.default_rng(0)
     before = stream.bit_generator.state
-    augment, frames = Augmentation(AugmentSettings()), grey(count=2)
+    augment, frames = Augmentation(AugmentSettings(strength=0.0)), grey(count=2)
     assert augment(frames, augment.draw(3, stream)) is frames
     assert stream.bit_generator.state == before
-    assert "augment" not in load_settings().as_dict()
-    assert load_settings(flags={"augment.strength": 1.0}).as_dict()["augment"]["strength"] == 1.0
+    assert "augment" not in load_settings(flags={"augment.strength": 0.0}).as_dict()
+    assert load_settings().as_dict()["augment"]["strength"] == 1.0
 
 
 def test_a_window_follows_from_its_seed_alone() -> None:
@@ -120,6 +121,35 @@ def test_places_move_as_far_as_they_should() -> None:
     torch.testing.assert_close(rows_along, -down, atol=0.06, rtol=0)  # of whole grey levels
 
 
+def test_jitter_and_rotation_are_drawn_for_themselves() -> None:
+    """Of the pictures that are turned, as many tremble as of the others."""
+    effects = OFF | {"rotation_deg": 40.0, "jitter_px": 3.0}
+    settings = AugmentSettings(strength=1.0, share=0.5, **effects)
+    found = Augmentation(settings)(ramp(), [1])[:, :, 20:45, 50:80].float()
+    down = found[..., 0].diff(dim=2).mean((2, 3))  # red falls or grows there where they are turned
+    turned = (down.abs() > 0.05).any(1)  # all but those by less than 3 degrees
+    trembling = (found[:, 0] != found[:, 1]).flatten(1).any(1)
+    for share in (turned.float().mean() / (37 / 40), trembling.float().mean()):
+        assert abs(share - 0.5) < 4 * 0.5 / COUNT**0.5
+    for group in (turned, ~turned):
+        assert abs(trembling[group].float().mean() - 0.5) < 4 * 0.5 / int(group.sum()) ** 0.5
+
+
+def test_as_many_pictures_stay_as_they_are_as_the_settings_say() -> None:
+    settings = AugmentSettings(strength=1.0, share=1.0, **OFF | {"clean": 0.25, "gain": 0.3})
+    before = ramp()
+    after = Augmentation(settings)(before, [1])
+    same = (after == before).flatten(1).all(1).float().mean()
+    assert abs(same - 0.25) < 4 * (0.25 * 0.75 / COUNT) ** 0.5
+
+
+def test_inputs_of_four_frames_take_no_more_numbers_than_there_are() -> None:
+    settings = AugmentSettings(strength=1.0, share=1.0, clean=0.0)
+    frames = ramp(8)[:, [0, 0, 1, 1]]
+    worse = Augmentation(settings)(frames, [7])
+    assert worse.shape == frames.shape and (worse != frames).flatten(1).any(1).all()
+
+
 def test_blur_and_rectangles() -> None:
     dot = torch.zeros(40, 2, 64, 128, 3, dtype=torch.uint8)
     dot[:, :, 20:44, 40:88] = 200
@@ -146,13 +176,28 @@ class Seen(Encoder):
         return super().forward(frames)
 
 
-def test_the_context_encoder_sees_worse_pictures_than_its_target() -> None:
+def worse_batch() -> TrajectoryBatch:
+    return TrajectoryBatch(grey(100, 4), torch.zeros(2, 1, 4), worse=grey(50, 4))
+
+
+def test_a_jepa_sees_clean_pictures_only() -> None:
+    """Its context encoder as well as its target, whatever a batch brings along."""
     encoder = Seen(16, "difference", centre=False)
     jepa = Jepa(
         encoder, Predictor(16, 16, 4), ema_decay=0.9, inverse_dynamics=0.0, rollout_strides=1,
         device=torch.device("cpu"),
     )  # fmt: skip
-    batch = TrajectoryBatch(grey(100, 4), torch.zeros(2, 1, 4), worse=grey(50, 4))
+    batch = worse_batch()
     jepa.losses(batch)
     target: Any = jepa.target.module
-    assert torch.equal(encoder.frames, batch.worse) and torch.equal(target.frames, batch.frames)
+    assert torch.equal(encoder.frames, batch.frames) and torch.equal(target.frames, batch.frames)
+
+
+def test_what_is_hardened_sees_worse_pictures_than_its_teacher() -> None:
+    encoder = Seen(16, "difference", centre=False)
+    hardening = Hardening(torch.nn.ModuleDict({"encoder": encoder}), torch.device("cpu"))
+    hardening.train()
+    batch = worse_batch()
+    hardening.losses(batch)
+    teacher: Any = hardening.networks["teacher"]
+    assert torch.equal(encoder.frames, batch.worse) and torch.equal(teacher.frames, batch.frames)

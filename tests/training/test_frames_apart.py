@@ -19,6 +19,7 @@ from hjepa_cli.stages.inputs import embed, open_dataset, render
 
 QUIET = Screen(quiet=True)
 TINY = {
+    "control.gains_n": [], "augment.steps": 3,
     "collect.trajectories": 3, "collect.test_trajectories": 2, "collect.clean_trajectories": 2,
     "collect.steps": 30, "collect.clean_steps": 12, "protocol.horizon": 10,
     "encoder.embedding": 16, "encoder.hidden": 16, "actor.hidden": 16, "encoder.steps": 3,
@@ -71,6 +72,6 @@ def test_the_loop_closes(trained: Path) -> None:
 
 def test_frames_that_a_device_has_forgotten_are_refused() -> None:
     for flags, most in (({"encoder.frames": 4, "encoder.frame_gap": 6}, 5),
-                        ({"encoder.frame_gap": 16}, 15)):  # fmt: skip
+                        ({"encoder.frames": 2, "encoder.frame_gap": 16}, 15)):  # fmt: skip
         with pytest.raises(UsageError, match=f"choose 1 to {most}"):
             check_settings(load_settings(flags=flags))

@@ -39,6 +39,8 @@ from hjepa_cli.storage.checkpoints import load_checkpoint, save_checkpoint
 
 QUIET = Screen(quiet=True)
 TINY = {
+    "control.gains_n": [],
+    "encoder.frames": 2,
     "collect.trajectories": 4,
     "collect.test_trajectories": 2,
     "collect.clean_trajectories": 2,
@@ -377,7 +379,7 @@ def test_a_run_says_what_it_found_and_repeats_to_the_last_bit(
     assert said["fitted"]["seed"] == decay_fit.SEARCH_SEED
     assert result["nmae_windows"].keys() == {name for name in METHODS if METHODS[name].reflex}
     rows = (workplace / "run" / "metrics.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows] == ["level", "chunk", "chunk_forces"]
+    assert [row.split(",")[1] for row in rows] == ["level", "chunk", "chunk_forces"]
 
 
 def test_encoder_and_actor_are_the_models(workplace: Path) -> None:

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +56,7 @@ TINY = {
     "encoder.batch_trajectories": 8,
     "encoder.batch_frames": 5,
     "encoder.gate": False,
+    "augment.steps": 3,
     "actor.epochs": 1,
     "actor.batch": 40,
     "hierarchy.rollout_steps": 8,
@@ -66,7 +66,7 @@ TINY = {
     "hierarchy.medium_steps": 2,
     "hierarchy.low_steps": 2,
 }
-STEPS = {"train-encoder": 5, "train-hierarchy": 9}  # of all loops of the stage
+STEPS = {"train-encoder": 5, "train-hierarchy": 12}  # of all loops of the stage
 
 Train = Callable[[Path], dict[str, Any]]
 
@@ -93,12 +93,13 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def trainer(stage: str, root: Path) -> Train:
+def trainer(stage: str, root: Path, **changes: object) -> Train:
+    chosen = settings(**changes)
     if stage == "train-encoder":
-        return lambda out: train_encoder.run(settings(), QUIET, dataset=root / "data", out=out)
+        return lambda out: train_encoder.run(chosen, QUIET, dataset=root / "data", out=out)
     encoder = str(root / "train-encoder")
     return lambda out: train_hierarchy.run(
-        settings(), QUIET, dataset=root / "data", encoder=encoder, out=out
+        chosen, QUIET, dataset=root / "data", encoder=encoder, out=out
     )
 
 
@@ -171,30 +172,47 @@ def test_interrupted_at_any_step_and_continued_is_uninterrupted(
                 assert interrupted.hint == f"hjepa resume {out}"
                 assert "all is saved" in interrupted.message
                 interruptions += 1
-    assert interruptions == (2 if stage == "train-encoder" else 3)
+    assert interruptions == (2 if stage == "train-encoder" else 5)
     assert_equal_runs(out, workplace / stage)
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("stage", "changes", "steps", "stopped"),
     [
-        {"encoder__regulariser": "sigreg", "encoder__regulariser_weight": 1.0},  # its directions
-        {"augment__strength": 1.0},  # its pictures
+        # Its directions.
+        (
+            "train-encoder",
+            {"encoder__regulariser": "sigreg", "encoder__regulariser_weight": 1.0},
+            3,
+            ("jepa", 3),
+        ),
+        # Its pictures: after one of the three steps in which the encoder is hardened, and before.
+        ("train-hierarchy", {"augment__strength": 0.5}, 10, ("hardening", 1)),
+        ("train-hierarchy", {"augment__strength": 0.5}, 9, ("flat", 2)),
     ],
-    ids=["sigreg", "augmentation"],
+    ids=["sigreg", "augmentation", "before augmentation"],
 )
 def test_what_is_drawn_goes_on_as_it_would_have(
-    changes: dict[str, Any], workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: str,
+    changes: dict[str, Any],
+    steps: int,
+    stopped: tuple[str, int],
+    workplace: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    chosen = settings(**changes)
+    train = trainer(stage, workplace, **changes)
     skip_actor(monkeypatch)
-    for name in ("whole", "interrupted", "interrupted"):
-        with monkeypatch.context() as patched, suppress(Interrupted):
-            if name == "interrupted":
-                signal_after(patched, 3)
-            train_encoder.run(chosen, QUIET, dataset=workplace / "data", out=tmp_path / name)
+    train(tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        signal_after(patched, steps)
+        with pytest.raises(Interrupted):
+            train(tmp_path / "interrupted")
+    saved = load_checkpoint(tmp_path / "interrupted" / PROGRESS_FILE).metadata
+    assert (saved["phase"], saved["step"]) == stopped
+    train(tmp_path / "interrupted")
     assert_equal_runs(tmp_path / "whole", tmp_path / "interrupted")
-    plain = workplace / "train-encoder" / "model.safetensors"
+    plain = workplace / stage / "model.safetensors"
     assert (tmp_path / "whole" / "model.safetensors").read_bytes() != plain.read_bytes()
 
 
@@ -202,10 +220,13 @@ def test_what_is_drawn_goes_on_as_it_would_have(
 def test_a_stop_between_saves_repeats_what_was_lost(
     stage: str, workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A crash loses steps and leaves rows of metrics behind; both are made again, once."""
+    """A crash loses steps and leaves rows of metrics behind; both are made again, once.
+
+    A hierarchy loses one in which its encoder is hardened, too.
+    """
     train, out = trainer(stage, workplace), tmp_path / "run"
     every_s = iter((1e9, 0.0, 1e9))
-    for steps in (1, 2, 2):
+    for steps in (1, 2, 2) if stage == "train-encoder" else (1, 10, 1):
         with monkeypatch.context() as patched:
             skip_actor(patched)
             crash_after(patched, steps)
@@ -252,6 +273,32 @@ def test_each_part_of_the_state_matters(
             trainer("train-encoder", workplace)(out)
         model = out / "model.safetensors"
         assert model.read_bytes() != (workplace / "train-encoder" / model.name).read_bytes()
+
+
+def test_the_teacher_of_hardening_is_part_of_the_state(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is nothing that one could make again: the encoder has gone on."""
+    out = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        skip_actor(patched)
+        signal_after(patched, 10)
+        with pytest.raises(Interrupted, match=r"after step 1 of 3 \(hardening\)"):
+            trainer("train-hierarchy", workplace)(out)
+    saved, prefix = load_checkpoint(out / PROGRESS_FILE), "networks.teacher."
+    teacher = {name: of for name, of in saved.tensors.items() if name.startswith(prefix)}
+    encoder = {name: saved.tensors[name.replace("teacher", "encoder", 1)] for name in teacher}
+    assert any((encoder[name] != value).any() for name, value in teacher.items())
+    kept = {name: value for name, value in saved.tensors.items() if name not in teacher}
+    save_checkpoint(out / PROGRESS_FILE, kept, saved.metadata)
+    with pytest.raises(DataError, match="does not fit this run"):
+        trainer("train-hierarchy", workplace)(out)
+    stem = f"{prefix}stem.weight"
+    other = {stem: -teacher[stem]}
+    save_checkpoint(out / PROGRESS_FILE, {**saved.tensors, **other}, saved.metadata)
+    trainer("train-hierarchy", workplace)(out)
+    model = out / "model.safetensors"
+    assert model.read_bytes() != (workplace / "train-hierarchy" / model.name).read_bytes()
 
 
 def test_a_state_goes_on_under_its_own_settings_only(
@@ -585,7 +632,8 @@ def test_the_levels_name_their_batches_too(
     *_, drawn, again = seen
     assert drawn == again and len(seen) == loops[level] + 2
     listed = ", ".join(map(str, drawn))
-    named = f"of 20 (shifted and mirrored copies last) the trajectories {listed})"
+    views = 8 * (1 + settings().hierarchy.shifted_copies)
+    named = f"of {views} (shifted and mirrored copies last) the trajectories {listed})"
     assert caught.value.message.endswith(named)
     assert (tmp_path / "run" / PROGRESS_FILE).exists() == (level != "high")
 

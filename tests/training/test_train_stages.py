@@ -23,7 +23,11 @@ from hjepa_cli.storage.checkpoints import load_checkpoint
 
 QUIET = Screen(quiet=True)
 TINY = {
+    "control.gains_n": [],
+    "encoder.frames": 2,
+    "augment.strength": 0.0,  # encoders stay as they are: test_hardening.py has the others
     "collect.trajectories": 6,
+    "collect.steps": 100,
     "collect.test_trajectories": 4,
     "collect.clean_trajectories": 2,
     "encoder.steps": 4,
