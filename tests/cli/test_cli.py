@@ -161,9 +161,9 @@ def test_a_flag_that_is_not_given_changes_nothing(shell, stage):
 @pytest.mark.parametrize(
     ("arguments", "defaults"),
     [
-        ("collect --help", ("trajectories. [default: 200]", "[default: desktop]")),
-        ("collect --help --preset smoke", ("trajectories. [default: 24]", "8]")),
-        ("collect --plant gym --help", ("trajectories. [default: 200]", "[default: gym]")),
+        ("collect --help", ("tuned law. [default: 200]", "[default: desktop]")),
+        ("collect --help --preset smoke", ("tuned law. [default: 24]", "8]")),
+        ("collect --plant gym --help", ("tuned law. [default: 200]", "[default: gym]")),
         ("train-encoder --help", ("[default: gate]", "encoder. [default: 1200]")),
         ("train-encoder --preset=smoke --help", ("[default: no-gate]", "encoder. [default: 6]")),
         ("scale --help", ("cell. [default: 20]", "round-robin, max-aoi, innovation]")),

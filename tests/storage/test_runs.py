@@ -231,7 +231,7 @@ def test_lines_cut_by_a_kill_are_dropped() -> None:
 def test_an_unfinished_run_keeps_its_settings() -> None:
     with Run.create("eval", Path("out"), SETTINGS):
         pass
-    with pytest.raises(UsageError, match=r"collect\.steps = 100, not 50") as caught:
+    with pytest.raises(UsageError, match=r"collect\.steps = 160, not 50") as caught:
         Run.create("eval", Path("out"), changed("collect.steps", 50))
     assert "--out" in (caught.value.hint or "")
     with Run.create("eval", Path("out"), SETTINGS) as run:  # the refusal gave the lock back
