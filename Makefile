@@ -17,7 +17,7 @@ demo:
 
 test:
 	@scripts/venv test
-	.venv/bin/python -m pytest -n 2 --dist loadfile $(ARGS)
+	.venv/bin/python -m pytest $(ARGS)
 
 lint:
 	@scripts/venv lint
