@@ -71,7 +71,7 @@ def _run_command(
                 streams.enter_context(redirect(nowhere))
         for path in _plugins(argv):  # one may add a command
             load_file(path)
-        returned = get_command(build()).main(argv, prog_name="hjepa", standalone_mode=False)
+        returned = get_command(build(argv)).main(argv, prog_name="hjepa", standalone_mode=False)
         return returned if isinstance(returned, int) else 0
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # the last resort
         if ends:

@@ -6,7 +6,7 @@ Imports nothing heavy; see :mod:`hjepa_cli.cli.commands`.
 import copy
 import inspect
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Self
 
 import typer
@@ -51,8 +51,14 @@ class ExplainedCommand(TyperCommand):
         return shown
 
 
-def build() -> typer.Typer:
-    """Return the program."""
+def build(words: Sequence[str] = ()) -> typer.Typer:
+    """Return the program; only the command that a command line begins with, or its group, if any.
+
+    The others would be made for nothing, which takes longer than some commands do.
+    """
+    named = words[0] if words else ""
+    listed = commands()
+    listed = tuple(one for one in listed if one.name.partition(" ")[0] == named) or listed
     program = typer.Typer(
         help="How many cart-poles does one radio cell support when a hierarchical JEPA drives "
         "them? The stages, in order: collect, train-encoder, train-hierarchy, eval, scale. The "
@@ -65,7 +71,7 @@ def build() -> typer.Typer:
         groups[name] = typer.Typer(help=text)
         groups[name].callback(invoke_without_command=True)(_print_help)
         program.add_typer(groups[name], name=name, rich_help_panel=TOOLS)
-    for command in commands():
+    for command in listed:
         group, _, name = command.name.rpartition(" ")
         panel = None if group else command.panel
         register = groups[group].command(

@@ -298,8 +298,10 @@ def _console(stream: TextIO) -> "Console":
 
 def _is_terminal(stream: TextIO) -> bool:
     """Return whether a bar can be redrawn; FORCE_COLOR makes rich say yes for files too."""
+    if not stream.isatty():  # before rich is imported for nothing
+        return False
     console = _console(stream)
-    return stream.isatty() and console.is_interactive and not console.is_dumb_terminal
+    return console.is_interactive and not console.is_dumb_terminal
 
 
 def layout(columns: Sequence[str], rows: Sequence[Sequence[str]], available: int) -> list[str]:

@@ -186,8 +186,7 @@ def run(
             score = simulated(runtime, planner, moved, camera, draws, sent, states, bar.advance)
         result = compared(settings, wired, score, states, kind.state_names)
         if harm is not None:
-            back = silence(steps, period_s, harm).stop
-            result["taken_up_after_s"] = max(wired.unplanned_until - back, 0) * period_s
+            result["taken_up_after_s"] = wired.driven_again_s(silence(steps, period_s, harm).stop)
         result |= {
             "model": model,
             "checkpoint": path,
@@ -439,6 +438,7 @@ def serving(model: Path, backend: str, bind: str, *, wait: bool = True) -> Itera
 def show(screen: Screen, result: dict[str, Any]) -> None:
     """Print a comparison."""
     low, high = result["score_difference_ci95"]
+    after_s = result.get("taken_up_after_s")
     screen.table(
         f"{result['n_devices']} devices, {result['n_steps']} steps, "
         + ("lockstep" if result["lockstep"] else f"{result['period_ms']:g} ms a step"),
@@ -451,7 +451,7 @@ def show(screen: Screen, result: dict[str, Any]) -> None:
             ["answers after their step", f"{100 * result['late_answers_share']:.1f} %"],
             ["strides skipped", result["skipped_strides"]],
             *(
-                [["all driven again after [s]", f"{result['taken_up_after_s']:.3f}"]]
+                [["all driven again after [s]", "never" if after_s is None else f"{after_s:.3f}"]]
                 if "taken_up_after_s" in result
                 else []
             ),

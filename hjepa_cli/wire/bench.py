@@ -23,6 +23,7 @@ from hjepa_cli.wire import protocol
 from hjepa_cli.wire.bundle import Bundle
 from hjepa_cli.wire.controller import Controller, Outgoing
 from hjepa_cli.wire.device import Device
+from hjepa_cli.wire.drive import LATE_STEPS
 from hjepa_cli.wire.runtime import Runtime, Singles
 
 AT_ONCE = 65_536  # datagrams that the bench takes in a step at most
@@ -43,6 +44,7 @@ class BenchOutcome:
         ages: steps between capture and first force of the embeddings that were answered.
         sources: device-steps by where their force came from.
         unplanned_until: step after the last one in which some device had no planned force.
+        began_s: when each step began [K], counted from the start of the drive.
         seconds: of the drive.
     """
 
@@ -53,7 +55,15 @@ class BenchOutcome:
     ages: dict[int, int]
     sources: dict[str, int]
     unplanned_until: int
+    began_s: Floats
     seconds: float
+
+    def driven_again_s(self, step: int) -> float | None:
+        """Return how long after a step began all were driven for good; ``None``: never."""
+        until = max(self.unplanned_until, step)
+        if until >= len(self.began_s):
+            return None
+        return float(self.began_s[until] - self.began_s[step])
 
 
 class Fleet:
@@ -178,7 +188,7 @@ class Fleet:
         shape = (len(played), *self.plants.plant.action_shape)
         return self.plants.move(np.asarray(forces_n, np.float64).reshape(shape))
 
-    def outcome(self, seconds: float) -> BenchOutcome:
+    def outcome(self, began_s: Floats, seconds: float) -> BenchOutcome:
         """Return what was measured."""
         sources: dict[str, int] = dict.fromkeys(protocol.SOURCES, 0)
         for device in self.devices:
@@ -194,6 +204,7 @@ class Fleet:
             ages=dict(sorted(self.ages.items())),
             sources=sources,
             unplanned_until=self.unplanned_until,
+            began_s=began_s,
             seconds=seconds,
         )
 
@@ -263,7 +274,7 @@ def lockstep(
             deliver(outgoing)
         fleet.play(k)
         tick()
-    return fleet.outcome(time.monotonic() - started_s)
+    return fleet.outcome(np.arange(float(steps)) * period_s, time.monotonic() - started_s)
 
 
 def flying_steps(link: LinkDraws, k: int, i: int) -> int:
@@ -283,6 +294,10 @@ def real_time(
     at_step: Callable[[int], None] = lambda k: None,
 ) -> BenchOutcome:
     """Drive a fleet over a socket, a step every period of wall time.
+
+    Where steps begin late the next ones follow at once. Only while devices drive themselves, which
+    this process computes for all of them, steps are counted from a late one, as each device counts
+    (:class:`~hjepa_cli.wire.drive.Drive`): a rush of all would be the bench's own.
 
     Args:
         fleet: the devices, all behind one socket.
@@ -326,11 +341,16 @@ def real_time(
             raise NumericalError(f"{lacking} of {len(fleet.devices)} devices were not taken up")
         send(fleet.upkeep(time.monotonic()))
         receive(0, time.monotonic() + 0.02)
-    first = fleet.sense(0)
-    start_s = time.monotonic()
+    pauses = any(device.has_actor for device in fleet.devices)
+    first, began_s = fleet.sense(0), np.empty(steps)
+    drive_s = start_s = time.monotonic()
     for k in range(steps):
+        began_s[k] = time.monotonic() - drive_s
         at_step(k)
         begins_s = start_s + k * period_s
+        if pauses and (late_s := time.monotonic() - begins_s) > LATE_STEPS * period_s:
+            start_s += late_s
+            begins_s += late_s
         send(fleet.upkeep(time.monotonic()))
         send(first if k == 0 else fleet.sense(k))
         receive(k, begins_s + deadline * period_s)
@@ -338,4 +358,4 @@ def real_time(
         tick()
         if (left_s := begins_s + period_s - time.monotonic()) > 0:
             time.sleep(left_s)
-    return fleet.outcome(time.monotonic() - start_s)
+    return fleet.outcome(began_s, time.monotonic() - drive_s)

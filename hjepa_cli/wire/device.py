@@ -19,7 +19,7 @@ from hjepa_cli.wire.runtime import Singles
 
 WATCHDOG_S = 0.08  # at most, in the plant's own time: poles that only hold a force fall soon after
 HELLO_S = 0.1  # between tries
-AGAIN_STEPS = 20  # between first embeddings of a session, until one is answered
+AGAIN_STEPS = 20  # between first embeddings of a session, until one is answered; after silence too
 QUIET_S = 0.5  # without a datagram the session is taken to be gone
 
 
@@ -70,7 +70,7 @@ class Device:
         self.refused, self.plant, self.server_version = protocol.WELCOME, "", protocol.VERSION
         self._session: bytes | None = None
         self._nonce, self._hello_s, self._tries = b"", -np.inf, 0
-        self._heard_s = -np.inf
+        self._heard_s, self._was_silent = -np.inf, False
         self._counter, self._sent, self._sent_step = 0, 0, -AGAIN_STEPS
         self._forces_n: dict[int, Singles] = {}
         self._last = Played(np.zeros(bundle.axes, np.float32), HELD)
@@ -96,9 +96,12 @@ class Device:
         return self._answered
 
     def is_new(self, step: int) -> bool:
-        """Say whether to send now, whatever the rule: the controller has not answered ever yet."""
-        unheard = self.connected and self._answered == NO_STEP
-        return unheard and step - self._sent_step >= AGAIN_STEPS
+        """Say whether to send now, whatever the rule: the controller knows nothing of now.
+
+        It has not answered ever yet, or was silent until a moment ago.
+        """
+        unknown = self.connected and (self._answered == NO_STEP or self._was_silent)
+        return unknown and step - self._sent_step >= AGAIN_STEPS
 
     # -- datagrams ------------------------------------------------------------------------------
 
@@ -124,7 +127,7 @@ class Device:
         if self._session is None:
             return None
         scale, codes = protocol.encode_int8(z)
-        self._sent, self._sent_step = self._sent + 1, step
+        self._sent, self._sent_step, self._was_silent = self._sent + 1, step, False
         packet = Embedding(
             device=self.number,
             step=step,
@@ -197,6 +200,7 @@ class Device:
         kept = {at: f for at, f in self._forces_n.items() if step <= at < message.first}
         fresh = enumerate(message.forces_n, message.first)
         self._forces_n = kept | {at: forces_n for at, forces_n in fresh if at >= step}
+        self._was_silent |= now_s - self._heard_s >= QUIET_S
         self._heard_s, self.silent = now_s, 0
         if message.base != self._answered:
             self._answered, self._lag = message.base, max(step - message.base, 0)

@@ -122,6 +122,27 @@ def test_help_answers_at_once_without_heavy_imports(command):
     pytest.fail(f"help took {help_s:.2f} s, the library alone {library_s:.2f} s")
 
 
+@pytest.mark.parametrize(
+    ("words", "made"),
+    [
+        (["serve", "--model", "eval"], {"serve"}),
+        (["models", "info"], {"models list", "models info", "models verify"}),
+        (["--help", "serve"], set(dict(commands()))),
+        (["sevre"], set(dict(commands()))),
+    ],
+)
+def test_a_command_line_makes_the_command_alone_that_it_begins_with(words, made):
+    """Help of the program and refusals of what there is not know all."""
+    top = get_command(build(words)).commands
+    found = {f"{name} {sub}" for name, group in top.items() for sub in inside(group)}
+    found |= {name for name, command in top.items() if not hasattr(command, "commands")}
+    assert found == {name for name in made if not hasattr(top.get(name), "commands")}
+
+
+def inside(group):
+    return getattr(group, "commands", ())
+
+
 def timed(*arguments):
     """A Python process that has ended, and the processor time that it took."""
     started = resource.getrusage(resource.RUSAGE_CHILDREN)

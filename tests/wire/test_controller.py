@@ -317,6 +317,20 @@ def test_a_restarted_server_takes_a_device_up_within_a_second():
             fresh.receive(killed.embed(step, np.ones(linear.SIZE, np.float32)), 1, now_s)
 
 
+def test_a_device_tells_a_server_that_comes_back_what_it_sees_now():
+    """Both were stopped only; what the server knows is old, and the next embedding may be far."""
+    server, one, *_ = ready()
+    z, silent_steps = np.ones(linear.SIZE, np.float32), 200
+    server.receive(one.embed(30, z), 1, 0.3)
+    answers = [data for data, _ in linear.settle(server, 0.3)]
+    one.receive(answers[0], 30, 0.3)
+    assert not one.is_new(60)  # it was silent for less than one notices
+    one.receive(answers[1], 30 + silent_steps, 0.3 + silent_steps * linear.PERIOD_S)
+    assert one.is_new(30 + silent_steps)
+    one.embed(30 + silent_steps, z)
+    assert not one.is_new(30 + 2 * silent_steps)  # once
+
+
 def test_a_device_that_is_slower_than_its_period_gets_every_force():
     """Both sides have too little time: strides are skipped by what the device needs, not by when.
 
