@@ -276,7 +276,7 @@ class HierarchySettings:
     coarse_steps: Count = 1600
     coarse_learning_rate: NotNegative = 1e-3
     coarse_weight_decay: NotNegative = 1e-3
-    flat_steps: Count = 1600  # ts-jepa-1 starts from nothing, P^H from the encoder's companion
+    flat_steps: Count = 1600
     medium_steps: Count = 1000
     medium_learning_rate: NotNegative = 1e-3
     medium_weight_decay: NotNegative = 2e-4

@@ -1,6 +1,5 @@
 """All methods of ``train-encoder`` share the loop that trains on camera frames."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -92,8 +91,7 @@ def fit(
         objective.train()
         batch = windows.draw(count, stream, share)
         if augmented and (seeds := augment.draw(count, stream)):
-            worse = augment(batch.frames.to(device), seeds[share])
-            batch = dataclasses.replace(batch, worse=worse)
+            batch = batch.shown(augment(batch.frames.to(device), seeds[share]))
         losses = objective.losses(batch)
         terms.update({name: part * term for name, term in losses.items()})
         return objective.total(terms), lambda: batch.drawn

@@ -148,15 +148,11 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     settings, screen, data = run.settings, run.screen, run.dataset
     trained = load_modules(source)
     screen.say(f"dataset {data.path}, encoder {source.path}, run {run.record.directory}")
-    begun = source.metadata["architecture"]
-    architecture = describe_architecture(settings, begun)
+    architecture = describe_architecture(settings, source.metadata["architecture"])
     shared = SHARED if trained_alike(source, data, settings) else ()
     if shared:
         screen.say("actor and ts-jepa-1 are the encoder checkpoint's: same data and settings")
-    taken = ["encoder", *shared]
-    if begun["kind"] == "encoder" and begun["h"] == architecture["h"]:  # with a P^H beside it
-        taken += {"high"} & {*levels_of(architecture)}
-    modules = begin(architecture, trained, settings, taken=taken)
+    modules = begin(architecture, trained, settings, taken=["encoder", *shared])
     train, test = run.render()
     flip = architecture["mirror"] == "augment"
     seen = embed_all(modules["encoder"], train, settings, screen, flip=flip)
@@ -165,7 +161,13 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
         screen.say("fitting the semantic actor")
         labels = torch.cat([labels.flatten(0, 1) for _, labels in seen])
         fit_actor_to(modules, "actor", join(views).z.flatten(0, 1), labels, architecture, settings)
-    train_levels(run, modules, architecture, views, shared)
+    # A device that was switched on a moment ago has copies of its first picture for older ones;
+    # predictors that start from those learn worse.
+    encoder = modules["encoder"]
+    assert isinstance(encoder, Encoder)
+    frames, frame_gap = encoder.look
+    remembers = max(frame_gap * (frames - 1) - 1, 0)
+    train_levels(run, modules, architecture, [view.since(remembers) for view in views], shared)
     examined, h = source.metadata["health"], architecture["h"]
     if settings.augment.strength and is_soft(source):
         harden(run, modules, train)

@@ -12,6 +12,7 @@ from hjepa_cli.core.control.embedded_split import embed_split
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
 from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.training.batches import FrameWindows
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import collect, train_encoder, train_hierarchy
@@ -60,6 +61,25 @@ def test_training_and_devices_see_the_same_frames(trained: Path) -> None:
     other = split.seen(1, frames=4, frame_gap=4).unflatten(0, (3, 30))
     # Of step 20: the frames of steps 8, 12, 16 and 20, which are stored one further on.
     assert torch.equal(other[:, 20], split.frames[:, [9, 13, 17, 21]])
+
+
+def test_copies_of_a_worse_picture_are_as_bad_as_it_is() -> None:
+    """A device that was switched on a moment ago remembers its first picture, noise and all."""
+    frames = torch.arange(7, dtype=torch.uint8).reshape(1, 7, 1, 1, 1).expand(1, 7, 16, 32, 3)
+    windows = FrameWindows(
+        frames.contiguous(), torch.zeros(1, 6), window_frames=6, stride=1, mirror=False,
+        frames_each=4,
+    )  # fmt: skip
+    batch = windows.draw(1, np.random.default_rng(0))
+    noisy = torch.rand(batch.frames.shape, generator=torch.manual_seed(0))
+    seen = batch.shown(noisy).seen
+    for k, alike in enumerate((3, 2, 1, 1)):
+        first, *others = seen[k]
+        assert [torch.equal(first, other) for other in others] == [
+            place < alike for place in range(1, 4)
+        ], k
+        assert torch.equal(seen[k, alike - 1 :], noisy[k, alike - 1 :])
+    assert torch.equal(batch.frames[0, 0], batch.frames[0, 2]) and batch.drawn
 
 
 def test_the_loop_closes(trained: Path) -> None:

@@ -26,6 +26,8 @@ class TrajectoryBatch:
         drawn: the windows' names, for messages.
         labels: the teacher's actions there ÷ force limit [B · F, *A], if the windows have any.
         worse: what a network shall see instead of ``frames``, of which targets are made.
+        sources: which of its κ pictures each is [B · F, κ]; others than itself where a device has
+            been switched on too recently to remember κ, and earlier ones are copies.
     """
 
     frames: Tensor
@@ -33,11 +35,18 @@ class TrajectoryBatch:
     drawn: str = ""
     labels: Tensor | None = None
     worse: Tensor | None = None
+    sources: Tensor | None = None
 
     @property
     def seen(self) -> Tensor:
         """Return what a network sees that learns."""
         return self.frames if self.worse is None else self.worse
+
+    def shown(self, worse: Tensor) -> "TrajectoryBatch":
+        """Return the batch with ``worse`` pictures; a copy of one is worse in the same way."""
+        if self.sources is not None:
+            worse = worse[torch.arange(len(worse))[:, None], self.sources]
+        return dataclasses.replace(self, worse=worse)
 
 
 def window_indices(
@@ -113,6 +122,8 @@ class FrameWindows:
         rows = trajectories[:, None]
         seen = torch.from_numpy(frames_seen(k.numpy(), self.frames_each, self.frame_gap))
         frames = self.frames[rows[..., None], seen]
+        copies = (seen == seen[..., :1]).sum(dim=-1, keepdim=True)
+        sources = torch.arange(self.frames_each).maximum(copies - 1)
         flipped = torch.zeros(len(k), dtype=torch.bool)
         if self.mirror:
             flipped = torch.from_numpy((generator.random(count) < 0.5)[share])
@@ -134,6 +145,7 @@ class FrameWindows:
             actions,
             f"windows of trajectories {', '.join(windows)}",
             None if labels is None else labels.flatten(0, 1),
+            sources=sources.flatten(0, 1),
         )
 
 

@@ -24,6 +24,10 @@ class EmbeddedTrajectories:
         """Return the first ``count`` trajectories."""
         return EmbeddedTrajectories(self.z[:count], self.actions[:count])
 
+    def since(self, k: int) -> "EmbeddedTrajectories":
+        """Return the trajectories from step k on."""
+        return EmbeddedTrajectories(self.z[:, k:], self.actions[:, k:])
+
     def choose(self, count: int, generator: np.random.Generator) -> Tensor:
         """Draw the trajectories [B] of a batch: what a loss below draws first."""
         total = len(self.z)
