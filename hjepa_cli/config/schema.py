@@ -225,9 +225,9 @@ class AugmentSettings:
     """
 
     strength: NotNegative = 1.0
-    steps: Count = 600
-    learning_rate: NotNegative = 5e-4
-    clean: Annotated[float, Meta(ge=0, le=1)] = 0.25  # share of pictures that stay as they are
+    steps: Count = 900
+    learning_rate: NotNegative = 7e-4
+    clean: Annotated[float, Meta(ge=0, le=1)] = 0.4  # share of pictures that stay as they are
     share: Annotated[float, Meta(ge=0, le=1)] = 0.25  # of the others, for each effect by itself
     gain: BelowOne = 0.35  # ± of 1
     gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
