@@ -16,6 +16,7 @@ from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.frames import frames_seen
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.statistics import ratio
+from hjepa_cli.stages.model_set import under_law_of
 from hjepa_cli.storage import files, zoo
 
 DEVICES = 12  # of the 64 on the cards: the same draws
@@ -29,7 +30,7 @@ def settings_of(model, card):
     flags = {"protocol.curve_devices": DEVICES, "protocol.bracket_devices": DEVICES}
     if "--protocol paper" in card:
         flags["protocol"] = "paper"
-    return load_settings(preset, flags=flags)
+    return under_law_of(model, load_settings(preset, flags=flags))
 
 
 def load(name):
@@ -48,7 +49,8 @@ def card_of(name):
 
 def rows_of(card):
     """The closed-loop table by method: column name → cell."""
-    lines = [line for line in card.splitlines() if line.startswith("|")]
+    (block,) = re.findall(r"<!-- table: card .*?<!-- end -->", card, re.DOTALL)
+    lines = [line for line in block.splitlines() if line.startswith("|")]
     table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     header = next(row for row in table if row[0] == "method")
     return {
@@ -129,10 +131,8 @@ def test_fresh_frames_are_read_as_well_as_the_card_says(name):
     """
     model = load(name)
     kind = plant(model.plant_name)
-    settings = load_settings(
-        model.metadata["settings"]["preset"],
-        flags={"seed": FRESH_SEED, "collect.trajectories": 80, "collect.test_trajectories": 10},
-    )
+    flags = {"seed": FRESH_SEED, "collect.trajectories": 80, "collect.test_trajectories": 10}
+    settings = under_law_of(model, load_settings(model.metadata["settings"]["preset"], flags=flags))
 
     def see(split):
         made = generate(settings, split)
