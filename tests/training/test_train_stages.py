@@ -166,24 +166,23 @@ def test_one_level_is_ts_jepa_of_that_depth(workplace: Path, h: int) -> None:
         planner_of(model, "hjepa")
 
 
-def test_the_companion_is_the_start_of_the_high_level_where_h_agrees(workplace: Path) -> None:
+def test_the_high_level_starts_from_nothing(workplace: Path) -> None:
+    """Not from the companion of the encoder, nor from that of a hierarchy on its encoder."""
     frozen = {"hierarchy__coarse_learning_rate": 0.0}
-    source = networks(workplace / "encoder")
-    train(workplace, "from-companion", **frozen)
-    started = networks(workplace / "from-companion")["high"].state_dict()
-    for name, weights in source["high"].named_parameters():
-        assert torch.equal(started[name], weights.bfloat16().float()), name
-    # The P^H of a hierarchy is trained already: on its encoder another one starts from nothing.
+    source = networks(workplace / "encoder")["high"].state_dict()
+    train(workplace, "from-nothing", **frozen)
+    fresh = networks(workplace / "from-nothing")["high"].state_dict()
+    assert not any(torch.equal(fresh[name], source[name]) for name in fresh if "weight" in name)
     again = train_hierarchy.run(
         settings(**frozen),
         QUIET,
         dataset=workplace / "data",
-        encoder=str(workplace / "from-companion"),
+        encoder=str(workplace / "from-nothing"),
         out=workplace / "on-a-trained-one",
     )
     assert again["method"] == "hjepa"
-    fresh = networks(workplace / "on-a-trained-one")["high"].state_dict()
-    assert not any(torch.equal(fresh[name], started[name]) for name in fresh if "weight" in name)
+    same = networks(workplace / "on-a-trained-one")["high"].state_dict()
+    assert all(torch.equal(fresh[name], same[name]) for name in fresh), "drawn by the seed"
 
 
 def test_an_interrupted_run_starts_again_and_ends_the_same(workplace: Path) -> None:
