@@ -1,9 +1,9 @@
 """Every setting is declared once: its type, bounds, default, and the flag that overrides it.
 
 The command line builds its flags and their help from these declarations, and
-:mod:`hjepa_cli.config.settings` checks files and flags against them. Units are in the names. Where
-the paper gives a value the default is that value, but for the protocol's, which are those of
-``--protocol paper``; the rest is ours (docs/explanation/paper_map.md).
+:mod:`hjepa_cli.config.settings` checks files and flags against them. Units are in the names. Values
+that the paper gives are those of preset ``paper`` and ``--protocol paper``; where defaults differ,
+docs/explanation/paper_map.md says why.
 """
 
 import dataclasses

@@ -21,6 +21,7 @@ from hjepa_cli.core.training.rendered import RenderedSplit, labels_of
 from hjepa_cli.stages.training import Drawn, TrainingRun
 
 STREAM = 2  # this stage's branch of the seed tree
+MOTION_STEPS = 100  # of a simulated trajectory, from its beginning, hold its widest motion
 
 
 def recorded(encoder: EncoderSettings, *names: str) -> dict[str, Any]:
@@ -40,7 +41,7 @@ def fit(
     steps: int | None = None,
     learning_rate: float | None = None,
 ) -> None:
-    """Train for ``encoder.steps`` steps, all phases on the same windows.
+    """Train on windows of frames, for ``encoder.steps`` steps unless ``steps`` says otherwise.
 
     Every batch is ``batch_trajectories`` windows of ``batch_frames`` frames, h steps apart. Every
     epoch ``look`` is called with the loss terms and returns a row of ``metrics.csv``.
@@ -67,7 +68,7 @@ def fit(
     longest = train.actions.shape[1]
     if run.settings.plant != RECORDED:
         # Simulated motion is widest at its beginning; windows from anywhere would hardly show it.
-        longest = min(longest, options.batch_frames * options.h)
+        longest = min(longest, max(MOTION_STEPS, options.batch_frames * options.h))
     windows = FrameWindows(
         train.frames[:, : longest + 1],
         train.actions[:, :longest],

@@ -27,6 +27,7 @@ from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import LEVELS, UNSAID, levels_of, load_modules
+from hjepa_cli.core.plants.frames import remembers_from
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training import levels
 from hjepa_cli.core.training.hardening import Hardening
@@ -161,13 +162,11 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
         screen.say("fitting the semantic actor")
         labels = torch.cat([labels.flatten(0, 1) for _, labels in seen])
         fit_actor_to(modules, "actor", join(views).z.flatten(0, 1), labels, architecture, settings)
-    # A device that was switched on a moment ago has copies of its first picture for older ones;
-    # predictors that start from those learn worse.
-    encoder = modules["encoder"]
-    assert isinstance(encoder, Encoder)
-    frames, frame_gap = encoder.look
-    remembers = max(frame_gap * (frames - 1) - 1, 0)
-    train_levels(run, modules, architecture, [view.since(remembers) for view in views], shared)
+    # Predictors that start from copies of a first picture learn worse.
+    look = {**UNSAID, **architecture}
+    first = remembers_from(look["frames"], look["frame_gap"])
+    first = max(min(first, views[0].z.shape[1] - 1 - architecture["h"]), 0)  # of short ones
+    train_levels(run, modules, architecture, [view.since(first) for view in views], shared)
     examined, h = source.metadata["health"], architecture["h"]
     if settings.augment.strength and is_soft(source):
         harden(run, modules, train)
@@ -189,8 +188,9 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
 
 
 def is_soft(source: Checkpoint) -> bool:
-    """Return whether an encoder is to be hardened: those of other checkpoints are hard already."""
-    return bool(source.metadata["architecture"]["kind"] == "encoder")
+    """Return whether an encoder is to be hardened: those of newer models are hard already."""
+    metadata = source.metadata
+    return metadata["architecture"]["kind"] == "encoder" or "augment" not in metadata["settings"]
 
 
 def harden(run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit) -> None:

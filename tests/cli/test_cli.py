@@ -436,7 +436,7 @@ def test_dry_run_plans_to_harden_an_encoder_once(shell):
     }
     save_checkpoint(encoder, {"w": np.zeros(1, np.float32)}, metadata)
     lines, seconds = planned("--encoder", encoder)
-    assert lines == ["harden the encoder for 600 steps on worse pictures"]
+    assert lines == [f"harden the encoder for {settings.augment.steps} steps on worse pictures"]
     off, quicker = planned("--encoder", encoder, "--config", "c.toml")
     assert off == [] and quicker < seconds - 200
     assert planned("--encoder", "desktop-h4m2l1")[0] == []

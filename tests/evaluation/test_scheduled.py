@@ -24,6 +24,7 @@ from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import block_loads, report, scale
 from hjepa_cli.stages.scale_by_simulation import BySimulation
+from hjepa_cli.storage import zoo
 
 SMALL = {
     "protocol": "paper",
@@ -39,6 +40,7 @@ def stage(tmp_path, monkeypatch):
     """The stage in an empty directory; returns a function of its settings."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(core_scheduled, "BLOCK_DEVICES", 100)
+    monkeypatch.setattr(zoo, "zoo_directory", lambda: tmp_path / "none")  # whose law would count
 
     def call(*methods, verify=False, **flags):
         given = {"radio." + key: value for key, value in flags.items()}

@@ -105,7 +105,7 @@ def test_impossible_values_are_refused_under_the_right_seal(
     path = model / "curves.json"
     document = json.loads(path.read_text())
     assert set(curves.read(path, Digest(**document["digest"]), named=True)) <= {
-        "chunk", "hold-decay", "hold-decay-linear",
+        "chunk", "chunk-forces", "hold-decay", "hold-decay-linear",
     }  # fmt: skip
     document["methods"]["chunk"] |= change
     path.write_text(json.dumps(seals.sealed(document)))

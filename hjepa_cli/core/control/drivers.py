@@ -2,7 +2,7 @@
 
 A method (:mod:`hjepa_cli.core.control.methods`) is a description; what it builds is a
 :class:`Driver`: the sensor that runs on each device, and controllers for as many devices as there
-are. Methods on embeddings send Ψ(previous frame, current frame), really rendered, encoded,
+are. Methods on embeddings send Ψ(its last κ frames), really rendered, encoded,
 quantised and dequantised.
 """
 
@@ -10,6 +10,8 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any
+
+import numpy as np
 
 from hjepa_cli.config.checks import late, split_late
 from hjepa_cli.config.schema import Settings
@@ -24,7 +26,7 @@ from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera
-from hjepa_cli.core.plants.named import plant, seen_as_trained
+from hjepa_cli.core.plants.named import camera_in, plant, seen_as_trained
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, UsageError, choices
 from hjepa_cli.plugins import CODECS, METHODS
@@ -140,7 +142,10 @@ def check_of(settings: Settings, model: Model) -> Callable[[int], PacketCheck] |
     train, test = (
         coder.send(sampled_embeddings(model, settings, split)) for split in ("train", "test")
     )
-    familiarity = fit_familiarity(train, test, protocol.false_alarm)
+    empty = np.zeros((2, model.frames, *camera_in(model.architecture).frame_shape), np.uint8)
+    empty[1] = 255
+    blank = coder.send(model.encode(empty))
+    familiarity = fit_familiarity(train, test, protocol.false_alarm, blank)
     return functools.partial(PacketCheck, familiarity, protocol.flagged_in_row)
 
 

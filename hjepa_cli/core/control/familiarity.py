@@ -6,6 +6,9 @@ and Q, how much of it lies beside these. Each may exceed its limit in half of th
 are allowed; the limits are quantiles on held-out pictures. (J. E. Jackson and G. S. Mudholkar,
 Control procedures for residuals associated with principal component analysis, 1979.)
 
+Pictures without anything in them, all black or white, are a third case: an encoder that fits a
+picture to its background sees nothing unusual in them. Their embeddings are known beforehand.
+
 It needs nothing of a device: the controller looks at what it has received.
 """
 
@@ -32,12 +35,14 @@ class Familiarity:
         components: orthonormal rows [N, D].
         variances: of the coefficients [N].
         limits: of T² and of Q.
+        blank: embeddings of empty pictures [B, D], and how near to one of them is too near.
     """
 
     mean: Tensor
     components: Tensor
     variances: Tensor
     limits: tuple[float, float]
+    blank: tuple[Tensor, float] | None = None
 
     def statistics(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return T² and Q [n] of embeddings [n, D]."""
@@ -50,11 +55,19 @@ class Familiarity:
         """Return which embeddings [n, D] are unlike those of training: bool [n]."""
         among, beside = self.statistics(z)
         flagged = (among > self.limits[0]) | (beside > self.limits[1])
+        if self.blank:
+            empty, near = self.blank
+            flagged |= torch.cdist(z.double().cpu(), empty).amin(1) < near
         return np.asarray((flagged | ~z.isfinite().all(1).cpu()).numpy())
 
 
-def fit_familiarity(training: Tensor, held_out: Tensor, false_alarm: float) -> Familiarity:
-    """Fit to embeddings [n, D], and calibrate on others [m, D] to a share of false alarms."""
+def fit_familiarity(
+    training: Tensor, held_out: Tensor, false_alarm: float, blank: Tensor | None = None
+) -> Familiarity:
+    """Fit to embeddings [n, D], and calibrate on others [m, D] to a share of false alarms.
+
+    Those nearer to one of ``blank`` [B, D] than half of the least distance in training are strange.
+    """
     z = training.double()
     mean = z.mean(0)
     variances, vectors = torch.linalg.eigh((z - mean).T @ (z - mean) / len(z))
@@ -64,6 +77,10 @@ def fit_familiarity(training: Tensor, held_out: Tensor, false_alarm: float) -> F
     fitted = Familiarity(mean, rows[:count], variances[:count].clamp_min(1e-12), (0.0, 0.0))
     limits = (torch.quantile(of, 1 - false_alarm / 2) for of in fitted.statistics(held_out))
     among, beside = (float(limit) for limit in limits)
+    if blank is not None:
+        empty = blank.double().cpu()
+        near = 0.5 * float(torch.cdist(z, empty).amin())
+        fitted = dataclasses.replace(fitted, blank=(empty, near))
     return dataclasses.replace(fitted, limits=(among, beside))
 
 

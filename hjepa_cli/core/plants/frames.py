@@ -28,6 +28,14 @@ def frames_seen(k: ArrayLike, frames: int, gap: int = 1) -> Integers:
     return np.maximum(np.asarray(k)[..., None] + 2 + frames_back(frames, gap), 0)
 
 
+def remembers_from(frames: int, gap: int = 1) -> int:
+    """Return the first step k in which a device has seen as many frames, and needs no copies.
+
+    What is fitted to embeddings begins there: those of copies are of their own kind.
+    """
+    return max(gap * (frames - 1) - 1, 0)
+
+
 def frames_back(frames: int, gap: int = 1) -> Integers:
     """Return the indices [κ] of what a network sees among the last frames of a device."""
     return gap * np.arange(1 - frames, 1) - 1
