@@ -144,8 +144,8 @@ class CartPolePixelsEnv(CartPoleEnv):
     """The camera sees the same cart-pole: observations are frames uint8 [64, 128, 3].
 
     One frame shows no velocity. ``gymnasium.wrappers.FrameStackObservation(env, 4)`` gives the
-    last four, uint8 [4, 64, 128, 3], which is what the encoder of ``desktop-h4m2l1`` takes. Those of
-    ``reset`` are its one frame, as wrappers have no other: a pole at rest to an encoder.
+    last four, uint8 [4, 64, 128, 3], which is what the encoder of ``desktop-h4m2l1`` takes. Those
+    of ``reset`` are its one frame, as wrappers have no other: a pole at rest to an encoder.
 
     Args:
         **options: those of :class:`CartPoleEnv`.
