@@ -1,8 +1,8 @@
 """``hjepa train-encoder --method supervised|autoencoder`` trains the baselines on raw frames.
 
-They see the windows that the JEPA sees, in the same steps of the same optimiser: the supervised
-network in one loop, the auto-encoder in two, first to reconstruct, then to act on what it
-reconstructed.
+They see windows of both laws, worse ones among them, in as many steps of the same optimiser: the
+supervised network in one loop, the auto-encoder in two, first to reconstruct, then to act on what
+it reconstructed.
 """
 
 import functools

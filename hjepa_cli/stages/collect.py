@@ -57,7 +57,7 @@ from hjepa_cli.storage.shards import (
 )
 
 OWN = ("control", "camera", "sensor")  # what a dataset brings along for all that is done with it
-FRAMES_PER_SAMPLE = 2  # κ: current and previous
+FRAMES_PER_SAMPLE = 2  # the paper's pairs
 TOGETHER = 20  # trajectories rendered at a time; the sample is one such batch
 WORTH_WORKERS = 4_000_000  # simulated steps; below, processes cost more than they bring
 MAX_SHARDS = 50_000  # which make a dataset.json of 10 MB; readers take 16

@@ -50,7 +50,7 @@ from hjepa_cli.stages.plan import Plan, seconds_of
 from hjepa_cli.storage import files
 
 FADING_KEY = 0xFAD1
-PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,000 frame pairs: rendered and encoded in seconds
+PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,600 inputs: rendered and encoded in seconds
 
 
 class Believer:

@@ -52,7 +52,7 @@ from hjepa_cli.wire.bundle import (
 )
 from hjepa_cli.wire.runtime import Runtime
 
-CALIBRATION, CHECKED = 512, 256  # frame pairs, of trajectories 0 … and of held-out ones
+CALIBRATION, CHECKED = 512, 256  # inputs, of trajectories 0 … and of held-out ones
 FLOAT_CONVOLUTIONS = 7  # of the int8 encoder: the stem, and three of each of two stages
 LARGEST_ERROR = 1e-5  # of z, and of forces ÷ limit, against torch
 NOT_EXPORTED = ("linear", "hjepa-fused")  # plan with more than the networks of a bundle

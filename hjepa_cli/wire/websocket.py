@@ -3,7 +3,7 @@
 Messages are msgpack; an array is a map with ``__ndarray__``, its bytes, dtype and shape. The server
 first sends what it is, then answers each observation with a chunk of actions. This door is for slow
 clients: TCP, one answer per question, no embedding on the device. A connection is a device: its
-last pictures are kept, as the encoder sees motion between two of them.
+last pictures are kept, as the encoder sees motion between them.
 """
 
 import contextlib

@@ -14,7 +14,7 @@ from hjepa_cli.core.plants.system import Camera
 if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
 
-SENSOR_BATCH = 256  # inputs of two frames rendered and encoded at a time: 12 MiB
+SENSOR_BATCH = 256  # inputs rendered and encoded at a time: 24 MiB of four frames
 
 
 def is_pixels(seen: Floats | Pixels) -> TypeGuard[Pixels]:
