@@ -270,7 +270,7 @@ def test_a_reader_of_linear_embeddings_controls_as_well_as_the_teacher(
     monkeypatch.setattr("hjepa_cli.core.control.embedded_split.embed_states", embed)
 
     class Blind:
-        plant = DESKTOP
+        plant, look = DESKTOP, (2, 1)
 
     model = Blind()
     reader = kalman.fit_state_reader(model, settings)

@@ -52,7 +52,7 @@ def test_the_main_table_is_what_the_commands_print(shell):
     document = shell("scale", "--snr", "10:30", "--checkpoint", MODEL, "--json").document
     counted = {row["method"]: row for row in document["rows"] if row["snr_db"] == 20}
     table = rows(TEXT, "| method | gap D* [ms]")
-    assert len(table) == 5 and {"oracle", "hjepa", "hold"} <= table.keys()
+    assert len(table) == 5 and {"oracle", "hjepa", "chunk"} <= table.keys()
     for method, row in table.items():
         found = counted[method]
         assert numbers(row["devices, Shannon"]) == [found["devices"], *found["devices_ci95"]]
@@ -66,7 +66,7 @@ def test_the_main_table_is_what_the_commands_print(shell):
     gains = {gain["over"]: gain["ratio"] for gain in document["gains"] if gain["method"] == "hjepa"}
     claim = TEXT[TEXT.index("<!-- table: claim -->") :].partition("<!-- end -->")[0]
     assert f"one packet in {counted['hjepa']['tolerance']:.0f} ms" in claim
-    assert f"{gains['hold']:.1f} times" in claim and f"{100 * gains['oracle']:.0f} %" in claim
+    assert f"{gains['ts-jepa-1']:.2f} times" in claim and f"{100 * gains['oracle']:.0f} %" in claim
 
 
 def test_scores_of_those_who_know_the_state_are_those_of_the_curves():

@@ -131,7 +131,7 @@ def test_dry_run_plans_the_law_and_the_methods_of_the_settings(shell):
         (["--methods", "hjepa"], "[hierarchy]\nh = 1\nm = 1\nl = 1", ["hjepa", "ts-jepa-1"]),
         ([], '[encoder]\nmethod = "supervised"', ["'supervised'", "'jepa'"]),
         ([], "[collect]\nsteps = 4", ["4 steps"]),
-        (["--methods", "hjepa"], "[hierarchy]\nh = 100", ["--h 100"]),
+        (["--methods", "hjepa"], "[hierarchy]\nh = 160", ["--h 160"]),
         ([], "[protocol]\nhorizon = 120", ["horizon = 120"]),
         ([], '[radio]\nsnr_db = "30:10"', ["--snr"]),
         (["--methods", "optimal,local"], '[radio]\nlaw = "scheduled"', ["nothing to schedule"]),

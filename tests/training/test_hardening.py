@@ -22,7 +22,7 @@ from hjepa_cli.core.training.jepa import Jepa
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.rendered import standardisation_sample
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import collect, train_encoder, train_hierarchy
+from hjepa_cli.stages import collect, frame_training, train_encoder, train_hierarchy
 from hjepa_cli.stages.training import untrained
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
@@ -166,10 +166,13 @@ def test_it_learns(networks: nn.ModuleDict, batch: TrajectoryBatch) -> None:
 def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset, its encoder, and a hierarchy on it with and without hardening."""
     root = tmp_path_factory.mktemp("hardening")
+    monkeypatch = pytest.MonkeyPatch()
+    monkeypatch.setattr(frame_training, "MOTION_STEPS", 20)  # whose windows are as short
     collect.run(settings(), QUIET, out=root / "data")
     train_encoder.run(settings(), QUIET, dataset=root / "data", out=root / "encoder")
     for name, strength in (("hard", 1.0), ("soft", 0.0)):
         levels(root, name, augment__strength=strength)
+    monkeypatch.undo()
     return root
 
 
@@ -194,6 +197,7 @@ def test_a_jepa_learns_from_what_the_teacher_drives(
     collect.run(options, QUIET, out=tmp_path / "data")
     seen: dict[str, list[Tensor]] = {"jepa": [], "hardening": []}
     windows: list[Tensor] = []
+    monkeypatch.setattr(frame_training, "MOTION_STEPS", 20)
     make = FrameWindows.__init__
 
     def of_windows(self: FrameWindows, frames: Tensor, actions: Tensor, **rest: Any) -> None:

@@ -39,7 +39,7 @@ def against_background(frames: Tensor, fit: str) -> Tensor:
         factor = WHITE / level.clamp_min(LEAST)
     else:
         half = apart[:, ::2].square().square_()
-        fourth = half.sum(1).view(frames.shape[0], width, -1).sum(1)
+        fourth = half.sum(1).view(frames.shape[0], width, frames.shape[3]).sum(1)
         spread = (fourth / (half.shape[1] * width)).sqrt().sqrt()
         factor = CONTRAST / spread.clamp_min(LEAST)
     return apart.mul_(factor.repeat(1, width)[:, None]).view(frames.shape)
