@@ -17,7 +17,7 @@ from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS, STAGES
-from hjepa_cli.stages import report
+from hjepa_cli.stages import report, train_hierarchy
 from hjepa_cli.stages.evaluate import check_horizon
 from hjepa_cli.stages.measuring import seconds_of_curves
 from hjepa_cli.stages.model_set import how_to_train
@@ -84,7 +84,8 @@ def parts(settings: Settings) -> list[Plan]:
         linked = [name for name in methods if METHODS[name].needs_link]
         counting, counting_s = plan_searches(settings, linked)
     return [
-        *(STAGES[name].plan(settings) for name in ("collect", "train-encoder", "train-hierarchy")),
+        *(STAGES[name].plan(settings) for name in ("collect", "train-encoder")),
+        train_hierarchy.plan_on(lambda _: (None, "encoder: the one before"), settings),
         Plan("eval", [], curves, [], 200_000, 5 + curves_s),
         Plan("scale", [], counting, [], 300_000, 5 + counting_s),
     ]

@@ -116,12 +116,26 @@ def plan(
     out: Path | None = None,
 ) -> Plan:
     """Plan the loops of the settings' strides on the embeddings of all views of the dataset."""
+
+    def find(asked: Settings) -> tuple[Checkpoint | None, str]:
+        opened = partial(open_encoder, encoder, asked, Screen(quiet=True))
+        return found("encoder", opened, encoder, "hjepa train-encoder")
+
+    return plan_on(find, settings, dataset, out)
+
+
+def plan_on(
+    find: Callable[[Settings], tuple[Checkpoint | None, str]],
+    settings: Settings,
+    dataset: Path | None = None,
+    out: Path | None = None,
+) -> Plan:
+    """Plan for the encoder that is found, or for one that is not trained yet."""
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
     settings = brought_along(settings, data.settings, data.path) if data else settings
-    find = partial(open_encoder, encoder, settings, Screen(quiet=True))
-    source, encoder_line = found("encoder", find, encoder, "hjepa train-encoder")
+    source, encoder_line = find(settings)
     architecture = describe_architecture(settings)
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))
     steps = sum(level_steps(architecture, settings.hierarchy).values())

@@ -109,6 +109,13 @@ def test_dry_run_plans_all_stages_and_writes_nothing(shell, preset):
     assert plan["seconds"] > single["seconds"]
 
 
+def test_dry_run_plans_to_harden_the_encoder_that_is_trained_here(shell):
+    """Whatever the zoo has, whose models are hard already."""
+    plan = shell("reproduce", "--dry-run", "--json").document["plan"]
+    hardening = [line for line in plan["work"] if "harden the encoder" in line]
+    assert len(hardening) == 1 and hardening[0].startswith("train-hierarchy: ")
+
+
 def test_dry_run_plans_the_law_and_the_methods_of_the_settings(shell):
     def plan(law, methods="hjepa,oracle,optimal"):
         Path("c.toml").write_text(f"[radio]\nlaw = {law!r}")
