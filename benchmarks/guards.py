@@ -472,7 +472,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         ("core/networks/outside.py", 'torch.from_numpy(np.require(array, requirements=["C", "W"]))', "torch.from_numpy(array)"),
     ),
     "test_outside.py::test_an_empty_batch_has_no_embeddings": (
-        (MODEL, "range(0, max(len(frames), 1), ENCODE_BATCH)", "range(0, len(frames), ENCODE_BATCH)"),
+        (MODEL, "range(0, max(len(frames), 1), together)", "range(0, len(frames), together)"),
     ),
     "test_outside.py::test_other_pictures_are_refused_with_what_they_are": (
         ("core/networks/outside.py", "    if array.dtype != np.uint8 or array.shape[1:] != shape or", "    if False and"),

@@ -30,7 +30,7 @@ from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint
 
-ENCODE_BATCH = 64  # larger ones fall out of the caches
+ENCODE_VALUES = 2**22  # larger arrays go back to the system after each use: twice as slow
 KINDS = ("encoder", "hierarchy", "flat", "supervised", "autoencoder", "reflex")
 CHOICES = {  # of an architecture; its other values are sizes
     "frame_input": ("difference", "pair"),
@@ -255,9 +255,9 @@ def encode_frames(
     precision: str,
 ) -> Tensor:
     """Return embeddings [N, D], float32 on the CPU, of uint8 frames [N, κ, H, W, 3]."""
-    parts = []
-    for start in range(0, max(len(frames), 1), ENCODE_BATCH):  # of no frames there is none, [0, D]
-        batch = frames[start : start + ENCODE_BATCH].to(device)
+    parts, together = [], max(ENCODE_VALUES // math.prod(frames.shape[1:]), 1)
+    for start in range(0, max(len(frames), 1), together):  # of no frames there is none, [0, D]
+        batch = frames[start : start + together].to(device)
         with autocast(device, precision):
             parts.append(encoder(batch).float().cpu())
     return torch.cat(parts)
