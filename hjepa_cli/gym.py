@@ -2,7 +2,7 @@
 
 Importing this module registers ``hjepa/CartPole-v0`` (the agent sees the state) and
 ``hjepa/CartPolePixels-v0`` (it sees the camera). Starts, process noise and length are those of the
-closed-loop protocol of ``hjepa eval``; only here an episode ends when the pole has fallen or the
+closed loop of ``--protocol paper``; only here an episode ends when the pole has fallen or the
 cart has left the picture, because agents learn little from a pole on the floor.
 """
 
