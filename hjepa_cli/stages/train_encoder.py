@@ -5,13 +5,12 @@ trajectories, look at the representation's health every epoch, and let the stage
 whether the result is worth handing on. The baselines are in :mod:`hjepa_cli.stages.baselines`.
 """
 
-import itertools
 import math
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.config.schema import RECORDED, Settings, dotted
@@ -232,12 +231,7 @@ def examine(
     mirror = kind.force_signs if options.mirror == "exact" else None
     encoder.eval()
     train_z, test_z = (embed(encoder, split, settings, every=every) for split in (train, test))
-    of_actions = {}
-    if settings.plant == RECORDED:  # where states may be unknown, this says what embeddings know
-        actions = (split.actions[:, ::every] for split in (train, test))
-        pairs = zip((train_z, test_z), actions, strict=True)
-        ends = itertools.chain.from_iterable(pairs)
-        of_actions = {"action_r2": health.action_r2(*ends, options.h // every)}
+    of_actions = know_actions(train_z, test_z, train, test, settings, h=options.h, every=every)
     per_trajectory, train_z, test_z = test_z, train_z.flatten(0, 1), test_z.flatten(0, 1)
     train_states, test_states = train.states_at(every), test.states_at(every)
     fit_z, fit_labels = train_z, train.labels_at(every)
@@ -257,13 +251,31 @@ def examine(
         error = health.nrmse(actor.act(test_z), test.labels_at(every))
     companion.to(resolve_device(settings.device)).train()
     return {
-        "probe_r2": health.probe_r2(train_z, train_states, test_z, test_states, kind.state_names),
-        "effective_rank": health.effective_rank(test_z),
-        "std": float(test_z.std(0).mean()),
+        **health.of_embeddings(train_z, train_states, test_z, test_states, kind.state_names),
         "action_sensitivity": sensitivity,
         "actor_nrmse": error,
         **of_actions,
     }
+
+
+def know_actions(
+    train_z: Tensor,
+    test_z: Tensor,
+    train: RenderedSplit,
+    test: RenderedSplit,
+    settings: Settings,
+    *,
+    h: int,
+    every: int = 1,
+) -> dict[str, float | None]:
+    """Return what embeddings [N, K, D] of every ``every``-th frame know of a stride's actions.
+
+    It is for recorded plants, whose states may be unknown; of others there is nothing to tell.
+    """
+    if settings.plant != RECORDED:
+        return {}
+    of_train, of_test = (split.actions[:, ::every] for split in (train, test))
+    return {"action_r2": health.action_r2(train_z, of_train, test_z, of_test, h // every)}
 
 
 def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any]]:
