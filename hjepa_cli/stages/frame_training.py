@@ -69,6 +69,11 @@ def fit(
     if run.settings.plant != RECORDED:
         # Simulated motion is widest at its beginning; windows from anywhere would hardly show it.
         longest = min(longest, max(MOTION_STEPS, options.batch_frames * options.h))
+    if options.shift_px:  # refuse a plant whose pictures cannot be moved before any step
+        kind.sideways(train.states[:1, 0].numpy().astype(float), options.shift_px)
+    labels = None
+    if isinstance(objective, Imitation):  # asking the teacher takes time, and nothing else needs it
+        labels = labels_of(train, kind, control_law(kind, run.settings.control))
     windows = FrameWindows(
         train.frames[:, : longest + 1],
         train.actions[:, :longest],
@@ -77,7 +82,7 @@ def fit(
         mirror=options.mirror == "augment",
         shift_px=options.shift_px,
         mirrored_actions=kind.mirror,
-        labels=labels_of(train, kind, control_law(kind, run.settings.control)),
+        labels=labels,
         frames_each=options.frames,
         frame_gap=options.frame_gap,
     )

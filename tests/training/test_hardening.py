@@ -213,7 +213,7 @@ def test_a_jepa_learns_from_what_the_teacher_drives(
         def losses(
             self: Any, batch: TrajectoryBatch, phase: str = phase, real: Any = objective.losses
         ) -> dict[str, Tensor]:
-            assert (batch.worse is None) == (phase == "jepa")
+            assert (batch.worse is None) == (phase == "jepa") and batch.labels is None
             seen[phase].append(windows[-1])
             found: dict[str, Tensor] = real(self, batch)
             return found

@@ -14,6 +14,8 @@ from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.drivers import build_driver, methods_of, planner_of
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.networks.symmetry import reflect
+from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS
@@ -90,6 +92,17 @@ def test_the_encoder_checkpoint_says_all_about_itself(workplace: Path) -> None:
     assert set(metadata["health"]["probe_r2"]) == {"x", "x_dot", "theta", "theta_dot"}
     assert metadata["settings"]["encoder"]["steps"] == 4
     assert metadata["camera"]["width_px"] == 128 and len(metadata["dataset"]) == 64
+
+
+def test_pictures_that_cannot_be_moved_are_not_trained_on(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An encoder asks for no labels, which would find out."""
+    monkeypatch.setattr(CartPolePlant, "sideways", System.sideways)
+    with pytest.raises(UsageError, match="does not say what moving its picture sideways means"):
+        train_encoder.run(settings(), QUIET, dataset=workplace / "data", out=tmp_path / "out")
+    still = settings(encoder__shift_px=0)
+    train_encoder.run(still, QUIET, dataset=workplace / "data", out=tmp_path / "still")
 
 
 def test_a_missed_gate_stops_the_pipeline_and_leaves_no_checkpoint(workplace: Path) -> None:
