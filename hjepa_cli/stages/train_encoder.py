@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.config.schema import RECORDED, Settings, dotted
+from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.datasets.trajectories import driven_by_teacher
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.encoder import Encoder
@@ -29,8 +30,21 @@ from hjepa_cli.errors import NumericalError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import measured, show_gates
 from hjepa_cli.stages import baselines
-from hjepa_cli.stages.frame_training import fit, recorded
-from hjepa_cli.stages.inputs import brought_along, count_frames, embed, open_dataset, pictures
+from hjepa_cli.stages.frame_training import (
+    fit,
+    frames_of_step,
+    recorded,
+    steps_of_epoch,
+    steps_shown,
+)
+from hjepa_cli.stages.inputs import (
+    brought_along,
+    count_frames,
+    embed,
+    open_dataset,
+    pictures,
+    sizes_of,
+)
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
     SPLITS,
@@ -85,15 +99,20 @@ def run(
 
 def plan(settings: Settings, *, dataset: Path | None = None, out: Path | None = None) -> Plan:
     """Plan the loops of the settings' method on the dataset's frames."""
-    options = settings.encoder
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
     settings = brought_along(settings, data.settings, data.path) if data else settings
-    frames = count_frames(data, settings, *SPLITS)
+    options, frames = settings.encoder, count_frames(data, settings, *SPLITS)
+    trajectories, recorded_steps = sizes_of(data, settings)["train"]
+    if options.method == "jepa":
+        trajectories = len(range(trajectories)[driven_by_teacher(settings)])
     loops, what = LOOPS[options.method]
-    batch, steps = options.batch_trajectories * options.batch_frames, loops * options.steps
-    epochs = steps * batch / count_frames(data, settings, "train")
+    batch, steps = frames_of_step(settings, recorded_steps), loops * options.steps
+    shown = steps_shown(settings, recorded_steps)
+    epochs = steps * batch / (trajectories * shown)
+    looks = loops * (options.steps // steps_of_epoch(settings, trajectories, recorded_steps))
+    look, examination = frames_looked_at(data, settings)
     return plan_training(
         "train-encoder",
         settings,
@@ -103,15 +122,28 @@ def plan(settings: Settings, *, dataset: Path | None = None, out: Path | None = 
         work=[
             f"render about {frames} frames",
             f"train {what} for {steps} steps of {batch} frames "
-            f"({epochs:.0f} passes over the data), h = {options.h}",
+            f"({epochs:.0f} passes over {shown} steps of {trajectories} trajectories), "
+            f"h = {options.h}",
             f"examine its health {'and stop at a missed gate' if options.gate else '(no gate)'}",
         ],
         amounts={
             "rendered frames": frames,
             "encoder training frames": steps * batch,
-            "encoded frames": (epochs / 4 + 3) * frames,  # a look at a quarter of them
+            "encoded frames": looks * look + examination,
         },
     )
+
+
+def frames_looked_at(data: Dataset | None, settings: Settings) -> tuple[float, int]:
+    """Return the frames that an epoch's look at training encodes, and the examination after it."""
+    options, frames = settings.encoder, count_frames(data, settings, *SPLITS)
+    trajectories, steps = sizes_of(data, settings)["train"]
+    held_out = count_frames(data, settings, "test")
+    if options.method != "jepa":
+        return held_out / baselines.LOOK_EVERY, frames
+    look = (min(trajectories, WATCHED) * steps + held_out) / math.gcd(4, options.h)
+    mirrored = options.mirror == "augment"  # the probe actor is fitted to mirror images too
+    return look, frames + mirrored * (frames - held_out)
 
 
 def train_and_gate(run: TrainingRun) -> dict[str, Any]:

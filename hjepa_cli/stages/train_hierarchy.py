@@ -50,12 +50,14 @@ from hjepa_cli.stages.embedding_training import (
     save,
 )
 from hjepa_cli.stages.frame_training import fit as fit_on_frames
+from hjepa_cli.stages.frame_training import frames_of_step
 from hjepa_cli.stages.inputs import (
     brought_along,
     check_same_plant,
     count_frames,
     embed,
     open_dataset,
+    sizes_of,
 )
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
@@ -145,7 +147,8 @@ def plan_on(
     work = [embedding, f"train {named}, ts-jepa-1 and the actor ({steps} steps)"]
     if settings.augment.strength and (source is None or is_soft(source)):
         work.append(f"harden the encoder for {settings.augment.steps} steps on worse pictures")
-        batch = settings.encoder.batch_trajectories * settings.encoder.batch_frames
+        _, recorded_steps = sizes_of(data, settings)["train"]
+        batch = frames_of_step(settings, recorded_steps)
         amounts["encoder training frames"] = settings.augment.steps * batch
     return plan_training(
         "train-hierarchy",
