@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +15,7 @@ import pytest
 from scipy import stats
 
 from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.schema import Settings, dotted
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.plugins import METHODS
 
@@ -128,6 +130,17 @@ def test_every_row_of_a_study_is_a_recipe_with_a_name_of_its_own(
                 assert (list(read) if isinstance(read, tuple) else read) == value
         recipes.append((settings, *row.get("strides", ())))
     assert len(set(recipes)) == len(recipes)
+
+
+@pytest.mark.parametrize("name", ["ablations", "embedding", "training_size"])
+def test_studies_at_half_the_training_halve_all_of_it(name: str) -> None:
+    """Of what is in their tables: ts-jepa-1 is not."""
+    study, settings = tomllib.loads((STUDIES[0].parent / f"{name}.toml").read_text()), Settings()
+    halved = dotted({key: of for key, of in study["common"].items() if key != "protocol"})
+    assert halved.pop("hierarchy.flat_steps") == 1
+    lengths = ("encoder.steps", "augment.steps", "actor.epochs")
+    lengths += tuple(f"hierarchy.{level}_steps" for level in ("coarse", "medium", "low"))
+    assert halved == {key: attrgetter(key)(settings) / 2 for key in lengths}
 
 
 def test_rows_have_what_is_common_unless_they_say_otherwise() -> None:
