@@ -324,7 +324,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         (RUNS, 'if recorded["schema"] == SCHEMA and (changed := differences(recorded["settings"], found)):', "if changed := []:"),
     ),
     "test_resume.py::test_a_state_goes_on_under_its_own_settings_only": (
-        (PROGRESS, "if saved.settings and settings and (changed := differences(saved.settings, settings)):", "if changed := []:"),
+        (PROGRESS, "if changed := differences(before, settings):", "if changed := []:"),
     ),
     "test_radio_input.py::test_what_the_law_would_not_read_is_refused_from_wherever_it_comes": (
         (CHECKS, "if laws and radio.law not in laws and not moves:", "if False:"),

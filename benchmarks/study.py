@@ -7,8 +7,7 @@ A study is a TOML file in ``benchmarks/studies/``: the methods to measure, and r
 the settings in which it differs from the preset and from what all rows have in ``common``. A row
 with ``strides`` trains these, one with ``flat`` also single levels of these depths on the same
 encoder, with the same actor, one with ``reflexes`` also what answers a packet by its age. A row
-whose ``encoder.method`` is a baseline on raw frames ends there. A row with a ``checkpoint`` only
-measures that one.
+whose ``encoder.method`` is a baseline on raw frames ends there.
 
 Everything is kept below ``--out`` in directories named after what they depend on, so rows share
 what they can (one dataset, one encoder), an interrupted study goes on with the same command, and a
@@ -41,11 +40,14 @@ from hjepa_cli.stages.compare import differences
 
 STUDIES = Path(__file__).parent / "studies"
 PROBES = {"x": "$x$", "x_dot": r"$\dot x$", "theta": r"$\theta$", "theta_dot": r"$\dot\theta$"}
-SECTIONS_OF = {  # a stage's results depend on these settings, and on the stages before
-    "collect": ("collect",),
-    "train-encoder": ("collect", "encoder", "actor"),
-    "train-hierarchy": ("collect", "encoder", "actor", "hierarchy"),
-    "train-reflex": ("collect", "encoder", "actor", "hierarchy", "reflex", "protocol"),
+OF_DATA = ("control", "camera", "sensor", "collect")
+OF_ENCODER = (*OF_DATA, "encoder", "augment", "actor")
+OF_LEVELS = (*OF_ENCODER, "hierarchy")
+SECTIONS_OF = {  # a stage's results depend on these settings, its own and those of stages before
+    "collect": OF_DATA,
+    "train-encoder": OF_ENCODER,
+    "train-hierarchy": OF_LEVELS,
+    "train-reflex": (*OF_LEVELS, "reflex", "protocol"),
 }
 
 
@@ -105,13 +107,11 @@ def measure(row: dict[str, Any], seed: int, methods: list[str], out: Path) -> di
         common = ("--preset", preset, "--config", config, "--seed", seed)
         return hjepa(stage, *common, *words)
 
-    def evaluate(checkpoint: str | Path, methods: list[str], *of: Any) -> dict[str, Any]:
+    def evaluate(checkpoint: Path, methods: list[str], *of: Any) -> dict[str, Any]:
         named = ("--checkpoint", checkpoint, "--methods", ",".join(methods))
         out = directory("eval", *of, methods, LOOP_VERSION)  # measured anew in another loop
         return dict(run("eval", *named, "--out", out)["methods"])
 
-    if "checkpoint" in row:
-        return {"health": {}, "methods": evaluate(row["checkpoint"], methods, row["checkpoint"])}
     data, encoder = directory("collect"), directory("train-encoder")
     run("collect", "--out", data)
     trained = run("train-encoder", "--no-gate", "--dataset", data, "--out", encoder)

@@ -64,9 +64,7 @@ def examine(
     train_z, test_z = (_read(networks, split, settings, every=1) for split in (train, test))
     names, states = plant_of(settings).state_names, (train.states_at(1), test.states_at(1))
     report = {
-        "probe_r2": health.probe_r2(train_z, states[0], test_z, states[1], names),
-        "effective_rank": health.effective_rank(test_z),
-        "std": float(test_z.std(0).mean()),
+        **health.of_embeddings(train_z, states[0], test_z, states[1], names),
         "action_sensitivity": None,
         "actor_nrmse": _actor_error(networks, test_z, test, every=1),
     }

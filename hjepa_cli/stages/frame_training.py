@@ -7,12 +7,12 @@ from torch import Tensor
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import RECORDED, EncoderSettings
+from hjepa_cli.config.schema import RECORDED, EncoderSettings, Settings
 from hjepa_cli.core.networks.model import UNSAID
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training.augmentation import Augmentation
-from hjepa_cli.core.training.batches import FrameWindows
+from hjepa_cli.core.training.batches import FrameWindows, frames_that_fit
 from hjepa_cli.core.training.frame_policies import Imitation, Reconstruction
 from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
@@ -28,6 +28,30 @@ def recorded(encoder: EncoderSettings, *names: str) -> dict[str, Any]:
     """Return the settings that an architecture records: those named, and others unless usual."""
     values = {name: getattr(encoder, name) for name in (*names, *UNSAID)}
     return {name: v for name, v in values.items() if name in names or v != UNSAID[name]}
+
+
+def steps_shown(settings: Settings, steps: int) -> int:
+    """Return how many of a trajectory's steps windows are cut from, from its beginning on.
+
+    Simulated motion is widest there; windows from anywhere would hardly show it.
+    """
+    if settings.plant == RECORDED:
+        return steps
+    options = settings.encoder
+    return min(steps, max(MOTION_STEPS, options.batch_frames * options.h))
+
+
+def frames_of_step(settings: Settings, steps: int) -> int:
+    """Return the frames that a step of training takes from trajectories of so many steps."""
+    options = settings.encoder
+    shown = steps_shown(settings, steps)
+    return options.batch_trajectories * frames_that_fit(shown, options.batch_frames, options.h)
+
+
+def steps_of_epoch(settings: Settings, trajectories: int, steps: int) -> int:
+    """Return how many steps of training take as many frames as windows are cut from."""
+    frames = trajectories * steps_shown(settings, steps)
+    return max(frames // frames_of_step(settings, steps), 1)
 
 
 def fit(
@@ -65,10 +89,12 @@ def fit(
         gradient_clip=options.gradient_clip,
         ranks=ranks,
     )
-    longest = train.actions.shape[1]
-    if run.settings.plant != RECORDED:
-        # Simulated motion is widest at its beginning; windows from anywhere would hardly show it.
-        longest = min(longest, max(MOTION_STEPS, options.batch_frames * options.h))
+    longest = steps_shown(run.settings, train.actions.shape[1])
+    if options.shift_px:  # refuse a plant whose pictures cannot be moved before any step
+        kind.sideways(train.states[:1, 0].numpy().astype(float), options.shift_px)
+    labels = None
+    if isinstance(objective, Imitation):  # asking the teacher takes time, and nothing else needs it
+        labels = labels_of(train, kind, control_law(kind, run.settings.control))
     windows = FrameWindows(
         train.frames[:, : longest + 1],
         train.actions[:, :longest],
@@ -77,7 +103,7 @@ def fit(
         mirror=options.mirror == "augment",
         shift_px=options.shift_px,
         mirrored_actions=kind.mirror,
-        labels=labels_of(train, kind, control_law(kind, run.settings.control)),
+        labels=labels,
         frames_each=options.frames,
         frame_gap=options.frame_gap,
     )
@@ -85,7 +111,7 @@ def fit(
     share, device = ranks.share(count), resolve_device(run.settings.device)
     augment = Augmentation(run.settings.augment)
     part = (share.stop - share.start) / count  # 1 on a single process
-    epoch_steps = max(windows.actions.shape[:2].numel() // (count * windows.window_frames), 1)
+    epoch_steps = steps_of_epoch(run.settings, *train.actions.shape[:2])
     terms: dict[str, Tensor] = {}
 
     def draw() -> Drawn:

@@ -199,9 +199,14 @@ def render(
     )
 
 
+def sizes_of(data: Dataset | None, settings: Settings) -> dict[str, tuple[int, int]]:
+    """Return trajectories and steps of splits; of no dataset, what the settings would collect."""
+    if not data:
+        return split_sizes(settings)
+    return {name: (of["trajectories"], of["steps"]) for name, of in data.splits.items()}
+
+
 def count_frames(data: Dataset | None, settings: Settings, *splits: str) -> int:
     """Return the frames of splits; of no dataset, those that the settings would collect."""
-    sizes = split_sizes(settings)
-    if data:
-        sizes = {name: (of["trajectories"], of["steps"]) for name, of in data.splits.items()}
+    sizes = sizes_of(data, settings)
     return sum(count * (steps + 1) for count, steps in (sizes[name] for name in splits))

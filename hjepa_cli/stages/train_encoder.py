@@ -5,16 +5,16 @@ trajectories, look at the representation's health every epoch, and let the stage
 whether the result is worth handing on. The baselines are in :mod:`hjepa_cli.stages.baselines`.
 """
 
-import itertools
 import math
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.config.schema import RECORDED, Settings, dotted
+from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.datasets.trajectories import driven_by_teacher
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.encoder import Encoder
@@ -30,8 +30,21 @@ from hjepa_cli.errors import NumericalError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import measured, show_gates
 from hjepa_cli.stages import baselines
-from hjepa_cli.stages.frame_training import fit, recorded
-from hjepa_cli.stages.inputs import brought_along, count_frames, embed, open_dataset, pictures
+from hjepa_cli.stages.frame_training import (
+    fit,
+    frames_of_step,
+    recorded,
+    steps_of_epoch,
+    steps_shown,
+)
+from hjepa_cli.stages.inputs import (
+    brought_along,
+    count_frames,
+    embed,
+    open_dataset,
+    pictures,
+    sizes_of,
+)
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
     SPLITS,
@@ -86,15 +99,20 @@ def run(
 
 def plan(settings: Settings, *, dataset: Path | None = None, out: Path | None = None) -> Plan:
     """Plan the loops of the settings' method on the dataset's frames."""
-    options = settings.encoder
     data, dataset_line = found(
         "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
     )
     settings = brought_along(settings, data.settings, data.path) if data else settings
-    frames = count_frames(data, settings, *SPLITS)
+    options, frames = settings.encoder, count_frames(data, settings, *SPLITS)
+    trajectories, recorded_steps = sizes_of(data, settings)["train"]
+    if options.method == "jepa":
+        trajectories = len(range(trajectories)[driven_by_teacher(settings)])
     loops, what = LOOPS[options.method]
-    batch, steps = options.batch_trajectories * options.batch_frames, loops * options.steps
-    epochs = steps * batch / count_frames(data, settings, "train")
+    batch, steps = frames_of_step(settings, recorded_steps), loops * options.steps
+    shown = steps_shown(settings, recorded_steps)
+    epochs = steps * batch / (trajectories * shown)
+    looks = loops * (options.steps // steps_of_epoch(settings, trajectories, recorded_steps))
+    look, examination = frames_looked_at(data, settings)
     return plan_training(
         "train-encoder",
         settings,
@@ -104,15 +122,28 @@ def plan(settings: Settings, *, dataset: Path | None = None, out: Path | None = 
         work=[
             f"render about {frames} frames",
             f"train {what} for {steps} steps of {batch} frames "
-            f"({epochs:.0f} passes over the data), h = {options.h}",
+            f"({epochs:.0f} passes over {shown} steps of {trajectories} trajectories), "
+            f"h = {options.h}",
             f"examine its health {'and stop at a missed gate' if options.gate else '(no gate)'}",
         ],
         amounts={
             "rendered frames": frames,
             "encoder training frames": steps * batch,
-            "encoded frames": (epochs / 4 + 3) * frames,  # a look at a quarter of them
+            "encoded frames": looks * look + examination,
         },
     )
+
+
+def frames_looked_at(data: Dataset | None, settings: Settings) -> tuple[float, int]:
+    """Return the frames that an epoch's look at training encodes, and the examination after it."""
+    options, frames = settings.encoder, count_frames(data, settings, *SPLITS)
+    trajectories, steps = sizes_of(data, settings)["train"]
+    held_out = count_frames(data, settings, "test")
+    if options.method != "jepa":
+        return held_out / baselines.LOOK_EVERY, frames
+    look = (min(trajectories, WATCHED) * steps + held_out) / math.gcd(4, options.h)
+    mirrored = options.mirror == "augment"  # the probe actor is fitted to mirror images too
+    return look, frames + mirrored * (frames - held_out)
 
 
 def train_and_gate(run: TrainingRun) -> dict[str, Any]:
@@ -232,12 +263,7 @@ def examine(
     mirror = kind.force_signs if options.mirror == "exact" else None
     encoder.eval()
     train_z, test_z = (embed(encoder, split, settings, every=every) for split in (train, test))
-    of_actions = {}
-    if settings.plant == RECORDED:  # where states may be unknown, this says what embeddings know
-        actions = (split.actions[:, ::every] for split in (train, test))
-        pairs = zip((train_z, test_z), actions, strict=True)
-        ends = itertools.chain.from_iterable(pairs)
-        of_actions = {"action_r2": health.action_r2(*ends, options.h // every)}
+    of_actions = know_actions(train_z, test_z, train, test, settings, h=options.h, every=every)
     per_trajectory, train_z, test_z = test_z, train_z.flatten(0, 1), test_z.flatten(0, 1)
     train_states, test_states = train.states_at(every), test.states_at(every)
     fit_z, fit_labels = train_z, train.labels_at(every)
@@ -257,13 +283,31 @@ def examine(
         error = health.nrmse(actor.act(test_z), test.labels_at(every))
     companion.to(resolve_device(settings.device)).train()
     return {
-        "probe_r2": health.probe_r2(train_z, train_states, test_z, test_states, kind.state_names),
-        "effective_rank": health.effective_rank(test_z),
-        "std": float(test_z.std(0).mean()),
+        **health.of_embeddings(train_z, train_states, test_z, test_states, kind.state_names),
         "action_sensitivity": sensitivity,
         "actor_nrmse": error,
         **of_actions,
     }
+
+
+def know_actions(
+    train_z: Tensor,
+    test_z: Tensor,
+    train: RenderedSplit,
+    test: RenderedSplit,
+    settings: Settings,
+    *,
+    h: int,
+    every: int = 1,
+) -> dict[str, float | None]:
+    """Return what embeddings [N, K, D] of every ``every``-th frame know of a stride's actions.
+
+    It is for recorded plants, whose states may be unknown; of others there is nothing to tell.
+    """
+    if settings.plant != RECORDED:
+        return {}
+    of_train, of_test = (split.actions[:, ::every] for split in (train, test))
+    return {"action_r2": health.action_r2(train_z, of_train, test_z, of_test, h // every)}
 
 
 def judge(report: dict[str, Any], settings: Settings) -> dict[str, dict[str, Any]]:

@@ -50,12 +50,14 @@ from hjepa_cli.stages.embedding_training import (
     save,
 )
 from hjepa_cli.stages.frame_training import fit as fit_on_frames
+from hjepa_cli.stages.frame_training import frames_of_step
 from hjepa_cli.stages.inputs import (
     brought_along,
     check_same_plant,
     count_frames,
     embed,
     open_dataset,
+    sizes_of,
 )
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.training import (
@@ -145,7 +147,8 @@ def plan_on(
     work = [embedding, f"train {named}, ts-jepa-1 and the actor ({steps} steps)"]
     if settings.augment.strength and (source is None or is_soft(source)):
         work.append(f"harden the encoder for {settings.augment.steps} steps on worse pictures")
-        batch = settings.encoder.batch_trajectories * settings.encoder.batch_frames
+        _, recorded_steps = sizes_of(data, settings)["train"]
+        batch = frames_of_step(settings, recorded_steps)
         amounts["encoder training frames"] = settings.augment.steps * batch
     return plan_training(
         "train-hierarchy",
@@ -181,12 +184,11 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     first = remembers_from(look["frames"], look["frame_gap"])
     first = max(min(first, views[0].z.shape[1] - 1 - architecture["h"]), 0)  # of short ones
     train_levels(run, modules, architecture, [view.since(first) for view in views], shared)
-    examined, h = source.metadata["health"], architecture["h"]
     if settings.augment.strength and is_soft(source):
         harden(run, modules, train)
-        examined = examined | {"probe_r2": probe_r2(modules, train, test, settings)}
     round_weights(modules)
-    examined = examined | examine(modules, test, h, settings)
+    screen.say("measuring health on all frames")
+    examined = examine(modules, train, test, architecture["h"], settings)
     model = save(run, modules, run.metadata(architecture, encoder=source.digest, health=examined))
     [method, *_] = methods_of(model)
     result = run.finish(
@@ -223,15 +225,6 @@ def harden(run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit) -> No
         learning_rate=augment.learning_rate,
     )
     encoder.requires_grad_(False)
-
-
-def probe_r2(
-    modules: nn.ModuleDict, train: RenderedSplit, test: RenderedSplit, settings: Settings
-) -> dict[str, float]:
-    """Return R² of the linear probes of the states, on every fourth frame."""
-    z = (embed(modules["encoder"], of, settings, every=4).flatten(0, 1) for of in (train, test))
-    (train_z, test_z), names = z, plant_of(settings).state_names
-    return health.probe_r2(train_z, train.states_at(4), test_z, test.states_at(4), names)
 
 
 def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) -> Checkpoint:
@@ -316,18 +309,28 @@ def describe_architecture(
 
 @torch.inference_mode()
 def examine(
-    modules: nn.ModuleDict, test: RenderedSplit, h: int, settings: Settings
-) -> dict[str, float | None]:
-    """Return the held-out health of what this stage trained: the actor and the coarsest level."""
-    z = embed(modules["encoder"], test, settings)
+    modules: nn.ModuleDict, train: RenderedSplit, test: RenderedSplit, h: int, settings: Settings
+) -> dict[str, Any]:
+    """Return the held-out health of what is saved: encoder, actor and coarsest level.
+
+    It is measured anew, as ``train-encoder`` does: hardening and rounding have moved the encoder.
+    """
+    kind = plant_of(settings)
+    train_z, z = (embed(modules["encoder"], split, settings) for split in (train, test))
     names = ("actor", "high" if "high" in modules else "flat")
     actor, coarsest = (copy.deepcopy(modules[name]).cpu().eval() for name in names)
     start, end = z[:, :-h].flatten(0, 1), z[:, h:].flatten(0, 1)
     return {
-        "actor_nrmse": health.nrmse(actor.act(z), test.labels),
-        "action_sensitivity": health.action_sensitivity(
-            coarsest, start, end, h, plant_of(settings).action_shape
+        **health.of_embeddings(
+            train_z.flatten(0, 1),
+            train.states_at(1),
+            z.flatten(0, 1),
+            test.states_at(1),
+            kind.state_names,
         ),
+        "action_sensitivity": health.action_sensitivity(coarsest, start, end, h, kind.action_shape),
+        "actor_nrmse": health.nrmse(actor.act(z), test.labels),
+        **train_encoder.know_actions(train_z, z, train, test, settings, h=h),
     }
 
 

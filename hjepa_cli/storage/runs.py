@@ -26,7 +26,7 @@ from hjepa_cli.compute import torchrun
 from hjepa_cli.compute.interrupts import exit_code
 from hjepa_cli.compute.versions import TRAINED_WITH, versions
 from hjepa_cli.config.schema import OFF, Settings, dotted, left_unsaid, spelled_out, unsaid
-from hjepa_cli.config.settings import load_settings
+from hjepa_cli.config.settings import PRESETS, load_settings
 from hjepa_cli.errors import (
     DataError,
     HjepaError,
@@ -47,6 +47,7 @@ RESULT = "result.json"
 SMOKE = "smoke"  # the preset that shows that all of it runs, too small to learn
 LAST_EVENTS_BYTES = 4096
 ASKED = ("remeasure", "verify")  # flags that are work, which a finished run has done or has not
+STRENGTH = "augment.strength"  # without any, all else in the section says nothing
 
 SCHEMA = 3  # of environment.json; 1 had neither a schema nor inputs, 2 no settings
 RESULT_SCHEMA = 2  # 1 had neither a schema nor a seal
@@ -62,6 +63,7 @@ class Run:
         self.directory = directory
         self.result: dict[str, Any] | None = None  # of a finished run: nothing is left to do
         self.settings: dict[str, Any] = {}  # as config.toml has them, once it is open
+        self.preset: str | None = None  # that it was begun with
         self.resumed = False  # the directory was there before, from an interrupted run
         self._lock = lock
         self._track: tracking.Tracker | None = None
@@ -182,6 +184,7 @@ class Run:
             self.resumed = True
             recorded = read_environment(self.directory)
             check_plugins(self.directory, recorded)
+            self.preset = recorded.get("preset")
             if recorded["stage"] != stage:
                 raise UsageError(
                     f"{self.directory} holds a run of '{recorded['stage']}', not of '{stage}'",
@@ -189,9 +192,9 @@ class Run:
                 )
             finished = self.path(RESULT).exists()
             try:
-                kept = load_recorded(recorded.get("preset"), self.directory).as_dict()
+                kept = load_recorded(self.preset, self.directory).as_dict()
             except UsageError:  # it has settings that this version has not: they are differences
-                kept = read_config(self.directory)
+                kept = read_config(self.directory) | {"preset": self.preset}
             changed = differences(kept, settings)
             if recorded["schema"] > 1:
                 changed += differences(*map(_digests, (recorded["inputs"], inputs)))
@@ -501,16 +504,24 @@ def load_recorded(preset: object, directory: Path) -> Settings:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Name the settings that differ, as ``section.key = old, not new``."""
+    """Name the settings that differ, as ``section.key = old, not new``.
+
+    What there was not yet in the old ones is as the preset that they name says, or off.
+    """
     before, after = dotted(old), dotted(files.jsonable(new))
-    if later := after.keys() - before.keys():  # settings that there were none of had their default
-        defaults = dotted(load_settings().as_dict()) | OFF
+    if later := after.keys() - before.keys():
+        preset = before.get("preset")
+        known = load_settings(preset if preset in PRESETS else None)
+        defaults = dotted(known.as_dict()) | OFF
         before |= {key: defaults[key] for key in later if key in defaults}
     after |= {key: OFF[key] for key in (before.keys() & OFF.keys()) - after.keys()}
+    idle = ["preset"]
+    if OFF[STRENGTH] in (before.get(STRENGTH), after.get(STRENGTH)):  # nothing reads others
+        idle += [key for key in before | after if key.startswith("augment.") and key != STRENGTH]
     return [
         f"{key} = {before.get(key)!r}, not {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys())
-        if key != "preset" and before.get(key) != after.get(key)
+        if key not in idle and before.get(key) != after.get(key)
     ]
 
 

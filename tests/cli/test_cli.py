@@ -410,10 +410,19 @@ def test_dry_run_promises_the_size_that_collect_needs(shell, preset):
     assert plan["writes_bytes"] == collect.size_bytes(load_settings(preset))
 
 
-@pytest.mark.parametrize(("preset", "passes"), [("default", 5), ("paper", 148)])
-def test_dry_run_counts_passes_over_the_training_frames(shell, preset, passes):
-    plan = shell("train-encoder", "--dry-run", "--json", "--preset", preset).document["plan"]
-    assert f"({passes} passes over the data)" in plan["work"][1]
+@pytest.mark.parametrize(
+    ("flags", "passes"),
+    [
+        ("", "1200 steps of 250 frames (15 passes over 100 steps of 200 trajectories)"),
+        ("--preset paper", "(150 passes over 100 steps of 200 trajectories)"),  # as its file says
+        ("--method supervised", "(8 passes over 100 steps of 400 trajectories)"),
+        ("--method autoencoder --frames 2", "2400 steps of 250 frames (15 passes over 100 steps"),
+    ],
+)
+def test_dry_run_counts_passes_over_what_a_method_learns_from(shell, flags, passes):
+    """A JEPA from the teacher's trajectories, baselines from the law's too; by their beginning."""
+    plan = shell("train-encoder", "--dry-run", "--json", *flags.split()).document["plan"]
+    assert passes in plan["work"][1]
 
 
 def test_dry_run_plans_to_harden_an_encoder_once(shell):

@@ -15,7 +15,7 @@ from hjepa_cli.core.control.codecs.integers import Integers
 from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.datasets.dataset import Trajectories
 from hjepa_cli.core.plants.named import Camera, plant
-from hjepa_cli.core.training.batches import FrameWindows
+from hjepa_cli.core.training.batches import FrameWindows, Labels, TrajectoryBatch
 from hjepa_cli.core.training.rendered import RenderedSplit, labels_of, standardisation_sample
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.embedding_training import embed_all
@@ -151,17 +151,21 @@ def test_labels_are_what_the_teacher_does_where_the_window_shows(
     in_view = recorded.states * np.array([0.2, 1, 0.5, 1], np.float32)
     split = render(dataclasses.replace(recorded, states=in_view), load_settings(), QUIET)
     kind = plant("desktop")
-    windows = FrameWindows(
-        split.frames,
-        split.actions,
-        window_frames=2,
-        stride=3,
-        mirror=mirror,
-        shift_px=2,
-        labels=labels_of(split, kind, kind.teacher()),
-    )
-    batch = windows.draw(16, np.random.default_rng(2))
-    assert batch.labels is not None
+
+    def drawn(labels: Labels | None) -> TrajectoryBatch:
+        windows = FrameWindows(
+            *(split.frames, split.actions),
+            window_frames=2,
+            stride=3,
+            mirror=mirror,
+            shift_px=2,
+            labels=labels,
+        )
+        return windows.draw(16, np.random.default_rng(2))
+
+    batch, unlabelled = drawn(labels_of(split, kind, kind.teacher())), drawn(None)
+    assert batch.labels is not None and unlabelled.labels is None
+    assert torch.equal(batch.frames, unlabelled.frames), "labels draw nothing"
     seen = set()
     for window, told in zip(
         batch.frames.unflatten(0, (16, 2)), batch.labels.unflatten(0, (16, 2)), strict=True

@@ -1,6 +1,7 @@
 """``hjepa eval`` end to end on an untrained model, its cache, and the ceilings of the protocol."""
 
 import dataclasses
+import hashlib
 import io
 import json
 import multiprocessing
@@ -28,6 +29,7 @@ from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.loop import Outcome
 from hjepa_cli.core.control.methods.true_state import true_state_driver
 from hjepa_cli.core.control.sensors import embedding_sensor
+from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation import simulator as simulator_module
 from hjepa_cli.core.evaluation import workers as workers_module
@@ -50,7 +52,7 @@ from hjepa_cli.errors import DataError, Interrupted, MissingInputError, Numerica
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import evaluate, measuring, resume, scale
 from hjepa_cli.stages.train_encoder import describe_architecture
-from hjepa_cli.storage import zoo
+from hjepa_cli.storage import files, zoo
 from hjepa_cli.storage.checkpoints import save_checkpoint
 from hjepa_cli.storage.runs import Run
 
@@ -59,6 +61,7 @@ DESKTOP = plant("desktop")
 TRUE_STATE = without_model()
 INT8 = Integers(256, 8)
 BY_TEACHER = {"control.gains_n": []}
+BELIEF = "collect.belief_steps"
 NO_LAW = {**BY_TEACHER, "control.ceiling_gains_n": []}
 
 
@@ -557,6 +560,20 @@ def test_what_is_fitted_to_other_trajectories_is_measured_again(tmp_path: Path, 
     ]
     first, second = (curves.Digest.of("model", one) for one in coarse)
     assert first.protocol != second.protocol  # components are fitted, whatever the method
+
+
+@pytest.mark.parametrize("law", [{}, BY_TEACHER], ids=["tuned law", "teacher alone"])
+def test_what_is_fitted_depends_on_wrong_beliefs_where_trajectories_do(law: dict[str, Any]) -> None:
+    small = load_settings("smoke", flags=law | {"collect.trajectories": 2})
+    shorter = load_settings("smoke", flags=law | {"collect.trajectories": 2, BELIEF: 8})
+    drawn, others = (generate(one, "train").states for one in (small, shorter))
+    assert np.array_equal(drawn, others) == (law == BY_TEACHER)
+    digest, other = (curves.Digest.of("model", one) for one in (small, shorter))
+    assert (digest.fitted == other.fitted) == (law == BY_TEACHER)
+    assert digest.protocol == other.protocol  # of methods that are fitted to nothing
+    # Before beliefs were looked at, the usual ones were no part of it.
+    before = [small.as_dict()["collect"][key] for key in curves.FITTED]
+    assert digest.fitted == hashlib.sha256(files.canonical_json(before).encode()).hexdigest()
 
 
 def test_late_packets_are_late_in_the_curves_too() -> None:

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +15,7 @@ import pytest
 from scipy import stats
 
 from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.schema import Settings, dotted
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.plugins import METHODS
 
@@ -130,6 +132,17 @@ def test_every_row_of_a_study_is_a_recipe_with_a_name_of_its_own(
     assert len(set(recipes)) == len(recipes)
 
 
+@pytest.mark.parametrize("name", ["ablations", "embedding", "training_size"])
+def test_studies_at_half_the_training_halve_all_of_it(name: str) -> None:
+    """Of what is in their tables: ts-jepa-1 is not."""
+    study, settings = tomllib.loads((STUDIES[0].parent / f"{name}.toml").read_text()), Settings()
+    halved = dotted({key: of for key, of in study["common"].items() if key != "protocol"})
+    assert halved.pop("hierarchy.flat_steps") == 1
+    lengths = ("encoder.steps", "augment.steps", "actor.epochs")
+    lengths += tuple(f"hierarchy.{level}_steps" for level in ("coarse", "medium", "low"))
+    assert halved == {key: attrgetter(key)(settings) / 2 for key in lengths}
+
+
 def test_rows_have_what_is_common_unless_they_say_otherwise() -> None:
     common = {"protocol": {"bracket": 0.1, "steps": 9}, "hierarchy": {"flat_steps": 1}}
     rows = [{"name": "a"}, {"name": "b", "strides": [8, 4, 2], "protocol": {"steps": 5}}]
@@ -160,7 +173,8 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
         {"name": "other strides", "strides": [16, 4, 1]},
         {"name": "measured otherwise", "protocol": {"curve_devices": 8}, "flat": [2, 3]},
         {"name": "raw frames", "encoder": {"method": "supervised"}},
-        {"name": "fixed", "checkpoint": "desktop-h4m2l1", "protocol": {"plant_spread": 0.2}},
+        {"name": "another law", "control": {"gains_n": [-60.0, -35.0, -110.0, -8.0]}},
+        {"name": "nothing hardened", "augment": {"strength": 0.0}},
     ]
     for row in rows:
         study.measure(row, 3, ["hjepa"], tmp_path)
@@ -168,27 +182,36 @@ def test_a_study_runs_what_rows_differ_in_and_shares_the_rest(
     def used(stage: str, flag: str) -> list[str]:
         return [words[words.index(flag) + 1] for words in ran if words[0] == stage]
 
-    assert len(set(used("collect", "--out"))) == 1
+    *plain, law, augmented = used("collect", "--out")
+    assert set(plain) == {augmented} != {law}
     encoders, levels = used("train-encoder", "--out"), used("train-hierarchy", "--out")
-    raw = encoders.pop()
+    *encoders, raw, law, augmented = encoders
     assert encoders == [encoders[0], encoders[1], encoders[0], encoders[0]]
-    assert len({raw, *encoders}) == 3
-    assert len(set(levels)) == 5 and levels[3] == levels[0]
-    assert used("train-hierarchy", "--encoder") == [*encoders, levels[0], levels[0]]
+    assert len({raw, law, augmented, *encoders}) == 5
+    assert len(set(levels)) == 7 and levels[3] == levels[0]
+    assert used("train-hierarchy", "--encoder") == [*encoders, *[levels[0]] * 2, law, augmented]
     strides = [[word for word in words if word.startswith("--h=")] for words in ran]
     assert [h for words, h in zip(ran, strides, strict=True) if words[0] == "train-hierarchy"] == [
         *([], [], ["--h=16"], []),
-        *(["--h=2"], ["--h=3"]),
+        *(["--h=2"], ["--h=3"], [], []),
     ]
-    assert used("eval", "--checkpoint") == [*levels, raw, "desktop-h4m2l1"]
+    assert used("eval", "--checkpoint") == [*levels[:6], raw, *levels[6:]]
     assert used("eval", "--methods") == [
         *(*["hjepa"] * 4, "ts-jepa-2", "ts-jepa-3"),
-        *("hjepa", "hjepa"),
+        *["hjepa"] * 3,
     ]
-    assert len(set(used("eval", "--out"))) == 8
+    assert len(set(used("eval", "--out"))) == 9
+
+    def told(stage: str, setting: str) -> int:
+        """How many of a stage's runs are told of a setting."""
+        return sum(setting in Path(config).read_text() for config in used(stage, "--config"))
+
     # What is only measured otherwise is not trained again: no stage sees the settings of another.
-    configs = {words[0]: Path(words[words.index("--config") + 1]) for words in ran[-8:]}
-    assert "curve_devices" not in configs["train-hierarchy"].read_text()
+    assert (told("train-hierarchy", "curve_devices"), told("eval", "curve_devices")) == (0, 3)
+    assert told("collect", "strength") == 0
+    for stage in ("collect", "train-encoder", "train-hierarchy", "eval"):
+        assert told(stage, "gains_n") == 1, stage
+    assert [told(stage, "strength") for stage in ("train-encoder", "train-hierarchy")] == [1, 1]
     assert {words[words.index("--seed") + 1] for words in ran} == {"3"}
 
 

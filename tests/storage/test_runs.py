@@ -377,8 +377,23 @@ def test_what_an_older_version_had_not_is_as_its_preset_says() -> None:
     with pytest.raises(UsageError, match=r"protocol\.bootstrap = \d+, not 7"):
         Run.create("eval", Path("out"), other)
     config.write_text("".join(older) + "[strange]\nnew = 1\n")
-    with pytest.raises(UsageError, match=r"strange\.new = 1, not None"):
+    with pytest.raises(UsageError, match=r"other settings: strange\.new = 1, not None$"):
         Run.create("eval", Path("out"), settings)
+
+
+def test_worse_pictures_that_nobody_makes_have_no_differences() -> None:
+    """Where they are off, on either side, how they would be made says nothing."""
+    on, weaker, off = (
+        changed("augment.strength", strength) | {"preset": "default"}
+        for strength in (1.0, 0.5, 0.0)
+    )
+    spelled = off | {"augment": {"strength": 0.0, "steps": 7, "gain": 0.1}}
+    assert runs.differences(off, spelled) == runs.differences(spelled, off) == []
+    assert runs.differences(on, off) == ["augment.strength = 1.0, not 0.0"]
+    assert runs.differences(off, on) == ["augment.strength = 0.0, not 1.0"]
+    weaker["augment"]["gain"] = 0.1
+    others = ["augment.gain = 0.35, not 0.1", "augment.strength = 1.0, not 0.5"]
+    assert runs.differences(on, weaker) == others
 
 
 def test_a_run_of_schema_1_goes_on(tmp_path: Path) -> None:

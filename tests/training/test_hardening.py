@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from hjepa_cli.config.schema import AugmentSettings, Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import load_dataset
+from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import LEVELS, load_modules
-from hjepa_cli.core.plants.named import Camera
+from hjepa_cli.core.plants.named import Camera, plant_of
 from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import FrameWindows, TrajectoryBatch
 from hjepa_cli.core.training.hardening import Hardening
@@ -23,6 +24,7 @@ from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.rendered import standardisation_sample
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import collect, frame_training, train_encoder, train_hierarchy
+from hjepa_cli.stages.inputs import embed, render
 from hjepa_cli.stages.training import untrained
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
@@ -211,7 +213,7 @@ def test_a_jepa_learns_from_what_the_teacher_drives(
         def losses(
             self: Any, batch: TrajectoryBatch, phase: str = phase, real: Any = objective.losses
         ) -> dict[str, Tensor]:
-            assert (batch.worse is None) == (phase == "jepa")
+            assert (batch.worse is None) == (phase == "jepa") and batch.labels is None
             seen[phase].append(windows[-1])
             found: dict[str, Tensor] = real(self, batch)
             return found
@@ -254,7 +256,7 @@ def test_a_hierarchy_hardens_its_encoder_last(workplace: Path) -> None:
             assert (value == encoder[name]).all(), name
 
 
-def test_hardening_is_told_in_metrics_and_health(workplace: Path) -> None:
+def test_hardening_is_told_in_metrics(workplace: Path) -> None:
     rows = [
         list(csv.DictReader((workplace / name / "metrics.csv").read_text().splitlines()))
         for name in ("hard", "soft")
@@ -262,12 +264,26 @@ def test_hardening_is_told_in_metrics_and_health(workplace: Path) -> None:
     assert rows[0][:-1] == rows[1] and {row["level"] for row in rows[1]} == {*LEVELS["hierarchy"]}
     assert (rows[0][-1]["level"], rows[0][-1]["step"]) == ("hardening", "4")
     assert 0 < float(rows[0][-1]["loss"]) < 1
-    with_hardening, without, before = (
-        load_checkpoint(workplace / name / "model.safetensors").metadata["health"]
-        for name in ("hard", "soft", "encoder")
+
+
+@pytest.mark.parametrize("name", ["hard", "soft"])
+def test_health_is_that_of_the_weights_that_are_saved(workplace: Path, name: str) -> None:
+    """Hardening moves the encoder, and rounding does: that of an encoder's run is of others."""
+    checkpoint = load_checkpoint(workplace / name / "model.safetensors")
+    told, encoder = checkpoint.metadata["health"], load_modules(checkpoint)["encoder"].eval()
+    options = settings()
+    train, test = (
+        render(load_dataset(workplace / "data").split(split), options, QUIET, split)
+        for split in ("train", "test")
     )
-    assert without["probe_r2"] == before["probe_r2"] != with_hardening["probe_r2"]
-    assert with_hardening["probe_r2"].keys() == before["probe_r2"].keys()
+    train_z, z = (embed(encoder, split, options).flatten(0, 1) for split in (train, test))
+    assert told["effective_rank"] == pytest.approx(health.effective_rank(z), rel=1e-6)
+    assert told["std"] == pytest.approx(float(z.std(0).mean()), rel=1e-6)
+    states, names = (train.states_at(1), test.states_at(1)), plant_of(options).state_names
+    r2 = health.probe_r2(train_z, states[0], z, states[1], names)
+    assert told["probe_r2"] == pytest.approx(r2, rel=1e-6)
+    before = load_checkpoint(workplace / "encoder" / "model.safetensors").metadata["health"]
+    assert before["effective_rank"] != told["effective_rank"] and told.keys() == before.keys()
 
 
 def test_an_encoder_is_hardened_once(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -323,6 +323,23 @@ def test_a_state_goes_on_under_its_own_settings_only(
         resume.run(out, QUIET)
 
 
+def test_a_state_of_an_older_version_goes_on_under_the_preset_of_its_run(tmp_path: Path) -> None:
+    """What its settings had not yet is as that preset says, not as the default one."""
+    smoke, path, said = load_settings("smoke"), tmp_path / "run" / PROGRESS_FILE, list[str]()
+
+    def opened() -> progress.Progress:
+        with runs.Run.create("train-encoder", path.parent, smoke.as_dict()) as record:
+            return progress.Progress(record, said.append)
+
+    assert [*opened().steps("jepa", 2, {}, np.random.default_rng(0))] == [0, 1]
+    saved = load_checkpoint(path)
+    del saved.metadata["settings"]["protocol"]["bootstrap"]
+    assert smoke.protocol.bootstrap != load_settings().protocol.bootstrap
+    save_checkpoint(path, dict(saved.tensors), saved.metadata)
+    opened()
+    assert said == [f"{path.parent}: jepa goes on after step 2"]
+
+
 def test_the_optimiser_keeps_its_memory_layout() -> None:
     """Moments in another layout would take another code path and end in other last bits."""
     weight = torch.nn.Parameter(torch.randn(4, 3, 5, 5).to(memory_format=torch.channels_last))

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ import torch
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.drivers import build_driver, methods_of, planner_of
-from hjepa_cli.core.networks.model import Model, load_modules
+from hjepa_cli.core.networks.model import Model, encode_frames, load_modules
 from hjepa_cli.core.networks.symmetry import reflect
+from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS
-from hjepa_cli.stages import collect, embedding_training, train_encoder, train_hierarchy
+from hjepa_cli.stages import collect, embedding_training, inputs, train_encoder, train_hierarchy
 from hjepa_cli.stages.train_hierarchy import open_encoder
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
@@ -90,6 +93,38 @@ def test_the_encoder_checkpoint_says_all_about_itself(workplace: Path) -> None:
     assert set(metadata["health"]["probe_r2"]) == {"x", "x_dot", "theta", "theta_dot"}
     assert metadata["settings"]["encoder"]["steps"] == 4
     assert metadata["camera"]["width_px"] == 128 and len(metadata["dataset"]) == 64
+
+
+def test_pictures_that_cannot_be_moved_are_not_trained_on(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An encoder asks for no labels, which would find out."""
+    monkeypatch.setattr(CartPolePlant, "sideways", System.sideways)
+    with pytest.raises(UsageError, match="does not say what moving its picture sideways means"):
+        train_encoder.run(settings(), QUIET, dataset=workplace / "data", out=tmp_path / "out")
+    still = settings(encoder__shift_px=0)
+    train_encoder.run(still, QUIET, dataset=workplace / "data", out=tmp_path / "still")
+
+
+@pytest.mark.parametrize("changes", [{}, {"mirror": "augment", "h": 2}, {"method": "supervised"}])
+def test_plans_count_the_frames_that_are_encoded(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]
+) -> None:
+    """In the looks at training and in the examination at its end."""
+    options = settings(**{f"encoder__{key}": value for key, value in changes.items()})
+    encoded = 0
+
+    def encode(encoder: object, frames: torch.Tensor, **rest: object) -> torch.Tensor:
+        nonlocal encoded
+        encoded += len(frames)
+        return encode_frames(encoder, frames, **rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(inputs, "encode_frames", encode)
+    monkeypatch.setattr(train_encoder, "plan_training", lambda *_, amounts, **__: amounts)
+    amounts: Any = train_encoder.plan(options, dataset=workplace / "data")
+    train_encoder.run(options, QUIET, dataset=workplace / "data", out=tmp_path / "out")
+    # Plans count frames as they are stored, of which each trajectory has one more.
+    assert amounts["encoded frames"] == pytest.approx(encoded, rel=0.02)
 
 
 def test_a_missed_gate_stops_the_pipeline_and_leaves_no_checkpoint(workplace: Path) -> None:

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import msgspec
 
 from hjepa_cli.config.checks import LATE
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import CollectSettings, Settings
 from hjepa_cli.core.control.loop import LOOP_VERSION
 from hjepa_cli.core.plants.conditions import altered
 from hjepa_cli.core.plants.named import definition
@@ -98,6 +98,8 @@ class Digest:
         fitted = [values["collect"][key] for key in FITTED]
         if _starts(values["collect"]) != starts:  # the dataset's are in ``clean``, these nowhere
             fitted.append(_starts(values["collect"]))
+        if wrong := _belief_steps(settings):
+            fitted.append(wrong)
         payload = settings.protocol.payload
         if CODECS[payload].fitted or settings.protocol.false_alarm:
             measured["fitted"] = fitted
@@ -108,6 +110,17 @@ class Digest:
     def as_dict(self) -> dict[str, Any]:
         """Return it as it stands in a file, for all of its methods."""
         return {name: value for name, value in vars(self).items() if name != "fitted"}
+
+
+def _belief_steps(settings: Settings) -> dict[str, int]:
+    """Return how long a tuned law goes by a wrong belief, of trajectories that it drives.
+
+    Nothing of the usual time, which all curves have that were measured before this was looked at:
+    they stay valid.
+    """
+    steps = settings.collect.belief_steps
+    tells = bool(settings.control.gains_n) and steps != CollectSettings().belief_steps
+    return {"belief_steps": steps} if tells else {}
 
 
 def _starts(collected: Mapping[str, Any]) -> list[Any]:

@@ -5,9 +5,25 @@ Nothing here trains the encoder; docs/reference/metrics.md lists the healthy ran
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
+
+
+def of_embeddings(
+    train_z: Tensor,
+    train_states: Tensor,
+    test_z: Tensor,
+    test_states: Tensor,
+    names: Sequence[str],
+) -> dict[str, Any]:
+    """Return what every encoder is examined for, of :func:`probe_r2`'s embeddings and states."""
+    return {
+        "probe_r2": probe_r2(train_z, train_states, test_z, test_states, names),
+        "effective_rank": effective_rank(test_z),
+        "std": float(test_z.std(0).mean()),
+    }
 
 
 def probe_r2(

@@ -35,22 +35,13 @@ class Augmentation:
     def __init__(self, settings: AugmentSettings) -> None:
         self._of = settings
 
-    @property
-    def on(self) -> bool:
-        """Return whether it does anything."""
-        return self._of.strength > 0
-
     def draw(self, count: int, generator: np.random.Generator) -> list[int] | None:
         """Draw seeds for windows; ``None``, and no draw, where it is off."""
-        return generator.integers(MOST_SEED, size=count).tolist() if self.on else None
+        on = self._of.strength > 0
+        return generator.integers(MOST_SEED, size=count).tolist() if on else None
 
-    def __call__(self, frames: Tensor, seeds: list[int] | None) -> Tensor:
-        """Return frames uint8 [B · F, κ, H, W, C], those of B windows one after the other, worse.
-
-        Without seeds they are ``frames`` themselves.
-        """
-        if seeds is None:
-            return frames
+    def __call__(self, frames: Tensor, seeds: list[int]) -> Tensor:
+        """Return worse frames uint8 [B · F, κ, H, W, C], those of B windows one after the other."""
         worse = torch.empty_like(frames)
         windows = (of.reshape(len(seeds), -1, *frames.shape[1:]) for of in (frames, worse))
         with torch.no_grad(), torch.autocast(frames.device.type, enabled=False):

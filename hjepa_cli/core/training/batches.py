@@ -49,6 +49,11 @@ class TrajectoryBatch:
         return dataclasses.replace(self, worse=worse)
 
 
+def frames_that_fit(steps: int, frames: int, stride: int) -> int:
+    """Return how many of a window's frames fit into trajectories of so many steps."""
+    return min(frames, (steps - 1) // stride + 1)
+
+
 def window_indices(
     length: int, frames: int, stride: int, generator: np.random.Generator, count: int
 ) -> Integers:
@@ -101,7 +106,7 @@ class FrameWindows:
     ) -> None:
         self.frames, self.actions = frames, actions
         self.steps = actions.shape[1]
-        self.window_frames = min(window_frames, (self.steps - 1) // stride + 1)
+        self.window_frames = frames_that_fit(self.steps, window_frames, stride)
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
         self.mirrored_actions = torch.tensor(mirrored_actions)
         self.labels, self.frames_each, self.frame_gap = labels, frames_each, frame_gap

@@ -182,8 +182,10 @@ class Progress:
             except (msgspec.ValidationError, KeyError, ValueError) as error:
                 raise self._misfit(error) from None
             settings = self._record.settings  # none where another process leads
-            if saved.settings and settings and (changed := differences(saved.settings, settings)):
-                raise self._misfit(f"it was saved under other settings: {'; '.join(changed)}")
+            if saved.settings and settings:
+                before = saved.settings | {"preset": self._record.preset}
+                if changed := differences(before, settings):
+                    raise self._misfit(f"it was saved under other settings: {'; '.join(changed)}")
             self._finished = list(saved.finished)
             if saved.threads != torch.get_num_threads():
                 torch.set_num_threads(saved.threads)
