@@ -112,6 +112,19 @@ def test_raw_frames_are_as_late_as_they_take_slots(stage, monkeypatch):
     assert stage(methods=("supervised-2",), config=wide)["rows"][0]["delay_steps"] == 0
 
 
+@pytest.mark.parametrize("start", ["steady", "paper"])
+def test_a_stated_gap_is_charged_as_the_protocol_starts(tmp_path, monkeypatch, start):
+    """⌊D c⌋ of 320 steps; K steps from the start on have 1 − 1/D packets more."""
+    monkeypatch.chdir(tmp_path)
+    settings = load_settings(flags={"radio.snr_db": "20", "protocol": start})
+    quiet = Screen(True, stdout=io.StringIO(), stderr=io.StringIO())
+    monkeypatch.setattr(scale, "draw", lambda *ignored: [])
+    [row] = scale.run(settings, quiet, tolerance_steps=320, checkpoint="desktop-h4m2l1")["rows"]
+    c, steps = 20e6 * 1e-3 * math.log2(101) / 2064, settings.protocol.steps
+    extra = 0 if start == "steady" else 1 - 1 / 320
+    assert row["devices"] == math.floor(c * steps / (steps / 320 + extra))
+
+
 def test_gains_stand_beside_the_papers(stage):
     result = stage()
     assert [(gain["over"], gain["snr_db"]) for gain in result["gains"]] == [
