@@ -91,7 +91,11 @@ class _Strides:
 
 
 class StrideController(_Strides):
-    """Plays a planner for n devices: a stride starts where the last one led to, or at a packet."""
+    """Plays a planner for n devices: a stride starts where the last one led to, or at a packet.
+
+    Attributes:
+        taken: whose stride started anew at a packet in the last step [n].
+    """
 
     def __init__(
         self,
@@ -104,6 +108,7 @@ class StrideController(_Strides):
         super().__init__(planner.stride, devices, action_shape)
         self._planner, self._starts = planner, self._z
         self.check = check(devices) if check else None
+        self.taken = np.zeros(devices, dtype=bool)
 
     def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
@@ -112,6 +117,7 @@ class StrideController(_Strides):
         """
         if self.check is not None:
             delivered, packets, ages = self.check.pass_on(delivered, packets, ages)
+        self.taken = delivered
         return super().act(delivered, packets, ages)
 
     def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
@@ -139,7 +145,7 @@ class StrideController(_Strides):
     @property
     def reached(self) -> tuple[Bools, Tensor]:
         """Return whose stride is over [n], and the embeddings [n, D] that strides lead to."""
-        return self._phase == self._stride, self._z
+        return self._over, self._z
 
     @property
     def belief(self) -> tuple[Tensor, Tensor, Floats]:
