@@ -42,6 +42,7 @@ def stage(tmp_path, monkeypatch):
             asked=(checkpoint, dataset),
             skipped=lambda methods: skipped,
             measurable=lambda methods: [name for name in methods if name in ENTRIES],
+            of=lambda method: SimpleNamespace(settings=settings, model=None),
             inputs=lambda **flags: flags,
         )
 
@@ -51,6 +52,10 @@ def stage(tmp_path, monkeypatch):
         model = {"checkpoint": "model", "checkpoints": {}}
         return model | {"methods": found, "source": "curves of the test"}
 
+    def build_driver(name, settings, model):
+        return SimpleNamespace(bits_per_transmission=ENTRIES[name]["bits_per_transmission"])
+
+    monkeypatch.setattr(scale_by_formula, "build_driver", build_driver)
     monkeypatch.setattr(scale_by_formula, "open_measurable", open_measurable)
     monkeypatch.setattr(scale_by_formula, "curves_for", curves_for)
 
