@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats, Integers
+from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.familiarity import PacketCheck
 from hjepa_cli.core.control.link import AHEAD_STEPS, REMEMBERED_STEPS, SentForces
 from hjepa_cli.core.networks.planning import Planner, Reaction
@@ -363,5 +364,5 @@ class Oracle:
         return states
 
     def _moved(self, states: Floats, forces_n: Floats) -> Floats:
-        # ±50 is where the loop clips true states too: a lost pole must not overflow.
-        return np.clip(self._advance(states, forces_n), -50.0, 50.0)
+        # The loop clips true states there, too: a lost pole must not overflow.
+        return np.clip(self._advance(states, forces_n), -STATE_LIMIT, STATE_LIMIT)
