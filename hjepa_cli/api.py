@@ -99,7 +99,8 @@ def drive(
     Args:
         method: as on the command line; those on embeddings need ``model``. Packets of ``hold+9``
             come 9 steps later than the settings' ``protocol.delay_steps`` say.
-        model: of :func:`load_model`, of the same plant.
+        model: of :func:`load_model`, of the same plant. It brings along the law that it learned and
+            the camera that it was trained with.
         gap_steps: a packet every so many steps; or
         delivery: a packet at every step that arrives with this probability. Neither: all arrive.
         devices: n.

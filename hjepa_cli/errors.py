@@ -71,10 +71,13 @@ def _quoted(word: str) -> str:
     return f"$'{''.join(plain)}'"
 
 
-def meant(name: object, names: Iterable[str]) -> str:
-    """Ask whether the nearest of some names was meant, for a message; ``""`` where none is near."""
+def meant(name: object, names: Iterable[str], prefix: str = "") -> str:
+    """Ask whether the nearest of some names was meant, for a message; ``""`` where none is near.
+
+    All of them are said with the ``prefix``.
+    """
     near = difflib.get_close_matches(str(name), names, n=1)
-    return f"did you mean '{near[0]}'? " if near else ""
+    return f"did you mean '{prefix}{near[0]}'? " if near else ""
 
 
 def choices(name: object, names: Iterable[str], verb: str = "choose from") -> str:

@@ -25,7 +25,8 @@ from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.checks import check_count
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.arrays import described
-from hjepa_cli.core.control.loop import STATE_LIMIT, noise_per_step
+from hjepa_cli.core.control.bounds import STATE_LIMIT
+from hjepa_cli.core.control.loop import noise_per_step
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.plants.named import Camera, CartPole

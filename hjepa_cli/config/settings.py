@@ -5,7 +5,6 @@ The defaults are those of :mod:`hjepa_cli.config.schema`; presets (TOML files in
 """
 
 import dataclasses
-import difflib
 import functools
 import operator
 import re
@@ -28,7 +27,7 @@ from hjepa_cli.config.schema import (
     must_be,
     plain,
 )
-from hjepa_cli.errors import DataError, MissingInputError, UsageError, choices
+from hjepa_cli.errors import DataError, MissingInputError, UsageError, choices, meant
 from hjepa_cli.plugins import LAWS, PHYS, PLANTS, read_regular
 
 _FOLDER = resources.files("hjepa_cli.config") / "presets"
@@ -210,10 +209,8 @@ def _merge(
     for name, value in changes.items():
         key = prefix + name
         if name not in values:
-            near = difflib.get_close_matches(name, values, n=1)
-            suggestion = (
-                f"did you mean '{prefix}{near[0]}'?" if near else f"valid keys: {', '.join(values)}"
-            )
+            near = meant(name, values, prefix).rstrip()
+            suggestion = near or f"valid keys: {', '.join(values)}"
             raise UsageError(f"unknown setting '{key}'{layer.place(key)}; {suggestion}")
         inside = isinstance(values[name], dict)
         if inside != isinstance(value, Mapping):

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
+from hjepa_cli.errors import MissingInputError, require
 from hjepa_cli.storage.files import jsonable
 
 if TYPE_CHECKING:  # rich costs 80 ms; it is imported when something is drawn
@@ -146,6 +147,16 @@ class Screen:
     @property
     def _results(self) -> TextIO:
         return self._stderr if self.json else self._stdout
+
+
+def can_draw(screen: Screen) -> bool:
+    """Tell whether there is matplotlib; without it say what installs it."""
+    try:
+        require("matplotlib", "a figure needs matplotlib", "plot")
+    except MissingInputError as missing:
+        screen.say(f"no figure: {missing.message}: {missing.hint}")
+        return False
+    return True
 
 
 @contextmanager

@@ -6,7 +6,6 @@ all they depend on, and tables. ``scale`` takes the same curves (:mod:`hjepa_cli
 
 import dataclasses
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from hjepa_cli.config.checks import check_gaps, check_methods
 from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.errors import MissingInputError, UsageError, require
 from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.screen import Screen, in_order
 from hjepa_cli.output.tables import show_evaluation, show_stress
@@ -154,10 +153,8 @@ def open_measurable(
     check_gaps(settings.protocol)
     actual_camera(settings)
     rows_of(settings)
-    if figure and find_spec("matplotlib") is None:
-        raise MissingInputError(
-            "a figure needs matplotlib, which is not installed", hint='pip install "hjepa[plot]"'
-        )
+    if figure:
+        require("matplotlib", "a figure needs matplotlib", "plot")
     models = open_model_set(settings, screen, checkpoint, dataset, further, one_seed=figure)
     rows_of(models.settings)  # of its pictures, which may be grey
     skipped = models.skipped(settings.methods)

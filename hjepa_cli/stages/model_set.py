@@ -13,12 +13,12 @@ from typing import Any
 
 from hjepa_cli.config.checks import needs_model, split_late, without_model
 from hjepa_cli.config.schema import RECORDED, Settings
-from hjepa_cli.core.control.drivers import methods_of, offered_methods
+from hjepa_cli.core.control.drivers import as_trained, methods_of, offered_methods
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.workers import ModelFile
 from hjepa_cli.core.networks.model import Model
-from hjepa_cli.core.plants.named import plant_of, seen_as_trained
+from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS
@@ -206,17 +206,14 @@ def open_model_set(
 
 
 def under_law_of(model: Model, settings: Settings) -> Settings:
-    """Return settings with the law that a model learned, and its pictures, for all beside it.
+    """Return settings with what a model brings along, for all beside it.
 
-    A ceiling is nobody's to learn: that of the settings stays where the model brings none. A sensor
-    that they set stays too.
+    Of a recorded plant it brings all that is known; of others what it was trained with, see
+    :func:`~hjepa_cli.core.control.drivers.as_trained`.
     """
-    record = model.metadata["settings"]
-    found = brought_along(settings, record, model.digest)
-    ceiling = found.control.ceiling_gains_n or settings.control.ceiling_gains_n
-    control = dataclasses.replace(found.control, ceiling_gains_n=ceiling)
-    sensor = seen_as_trained(settings, record).sensor
-    return dataclasses.replace(found, control=control, sensor=sensor)
+    found = brought_along(settings, model.metadata["settings"], model.digest)
+    own = as_trained(settings, model)
+    return dataclasses.replace(found, control=own.control, sensor=own.sensor)
 
 
 def how_to_train(method: str, settings: Settings) -> str:

@@ -19,7 +19,7 @@ from hjepa_cli.core.plants.named import plant, plant_in
 from hjepa_cli.errors import MissingInputError, UsageError, shell
 from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.page import explained, gain_rows, headline, methods_of, parts
-from hjepa_cli.output.screen import Screen, described_steps, in_order, span, tolerance
+from hjepa_cli.output.screen import Screen, can_draw, described_steps, in_order, span, tolerance
 from hjepa_cli.output.tables import (
     offline_columns,
     offline_rows,
@@ -222,14 +222,10 @@ def has_intervals(result: Result) -> bool:
 
 def draw(described: Mapping[str, Any], directory: Path, screen: Screen, asked: Looks) -> Figures:
     """Return the figures of a run, or none without matplotlib."""
-    try:
-        stage, result = described["stage"], described["result"]
-        return FIGURES[stage](result, described["config"], directory, asked)
-    except ModuleNotFoundError as missing:
-        if not (missing.name or "").startswith("matplotlib"):
-            raise
-        screen.say('no figures without matplotlib: pip install "hjepa[plot]"')
+    if not can_draw(screen):
         return {}
+    stage, result = described["stage"], described["result"]
+    return FIGURES[stage](result, described["config"], directory, asked)
 
 
 def _svg(figure: Any) -> str:

@@ -23,7 +23,7 @@ from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.looks import Looks
-from hjepa_cli.output.screen import Screen
+from hjepa_cli.output.screen import Screen, can_draw
 from hjepa_cli.output.tables import ALLOCATION, show_allocations
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.stages import results
@@ -233,13 +233,10 @@ def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> Path:
 
 def draw(result: Mapping[str, Any], asked: Looks, directory: Path, screen: Screen) -> list[Path]:
     """Write ``devices`` as PNG, SVG and PDF; without matplotlib say how to get them."""
-    try:
-        from hjepa_cli.output import figures
-    except ModuleNotFoundError as missing:
-        if not (missing.name or "").startswith("matplotlib"):
-            raise
-        screen.say('no figure without matplotlib: pip install "hjepa[plot]"')
+    if not can_draw(screen):
         return []
+    from hjepa_cli.output import figures
+
     usual = f"{described(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI"
     figure = figures.scale_figure(result, dataclasses.replace(asked, title=asked.titled(usual)))
     return [figures.save(figure, directory / f"devices.{kind}") for kind in figures.METADATA]

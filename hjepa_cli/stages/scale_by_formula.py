@@ -1,5 +1,6 @@
 """This half of ``hjepa scale`` counts by laws with a formula, from what ``eval`` measures."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,8 +9,8 @@ from typing import Any
 from hjepa_cli.config.checks import late
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control import link
+from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
-from hjepa_cli.core.plants.frames import frame_bits
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
@@ -44,6 +45,7 @@ class ByFormula:
         self.models = open_measurable(settings, screen, checkpoint, dataset, further)
         self._law, self._settings, self._screen = law, settings, screen
         self._cell = Cell.of(settings, plant_of(settings))
+        self._frame_bits = functools.cache(self._bits_of)  # the same at every SNR
 
     def measured_methods(self, grid_db: Sequence[float]) -> dict[float, list[str]]:
         """Return by SNR the methods that can be measured, late where the law makes them so.
@@ -145,11 +147,14 @@ class ByFormula:
     def _in_time(self, method: str, snr_db: float) -> str:
         if METHODS[method].sends != "frames":
             return method
-        bits = int(method.rpartition("-")[2]) * frame_bits(self._settings.camera.frame_shape)
-        forces = len(plant_of(self._settings).force_signs)
-        bits += link.confirmation_bits(self._settings.protocol, forces)
-        delay_slots = self._law.asked("delay_slots", self._cell.link(bits, snr_db))
+        cell = self._cell.link(self._frame_bits(method), snr_db)
+        delay_slots = self._law.asked("delay_slots", cell)
         return late(method, math.ceil(delay_slots * (1 - ROUNDING)))
+
+    def _bits_of(self, method: str) -> int:
+        """Return what a packet takes: of the pictures that the method's own model sees."""
+        holder = self.models.of(method)
+        return build_driver(method, holder.settings, holder.model).bits_per_transmission
 
     def _verify(self, loop: LinkRequirement) -> list[Row]:
         """Drive a block of loops a little inside and a little outside a tolerance.

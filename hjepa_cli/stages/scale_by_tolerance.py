@@ -76,7 +76,7 @@ class ByTolerance(ByFormula):
             at_least=False,
             payload_bits=self._bits,
             delay_steps=0,
-            warmup_steps=0,
+            warmup_steps=self._settings.protocol.warmup_steps,
             scored_steps=self._settings.protocol.steps,
         )
         path: Path | None = self.models.path

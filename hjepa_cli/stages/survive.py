@@ -30,7 +30,7 @@ from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.duty import duty_devices
 from hjepa_cli.errors import MissingInputError, UsageError
 from hjepa_cli.output.looks import Looks
-from hjepa_cli.output.screen import Screen, span, ticking
+from hjepa_cli.output.screen import Screen, can_draw, span, ticking
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import results
 from hjepa_cli.stages.inputs import refuse_recorded
@@ -443,13 +443,10 @@ def needed_links(curve: Row, settings: Settings, step_s: float) -> dict[str, Any
 
 def draw(result: Mapping[str, Any], directory: Path, screen: Screen) -> list[Path]:
     """Write ``survival.png`` and ``survival.svg``; without matplotlib say how to get them."""
-    try:
-        from hjepa_cli.output import figures
-    except ModuleNotFoundError as missing:
-        if not (missing.name or "").startswith("matplotlib"):
-            raise
-        screen.say('no figure without matplotlib: pip install "hjepa[plot]"')
+    if not can_draw(screen):
         return []
+    from hjepa_cli.output import figures
+
     title = f"{result['plant']}, {result['n_loops']} loops, 95 % CI"
     figure = figures.survival_figure(result, Looks(title=title))
     return [figures.save(figure, directory / f"survival.{kind}") for kind in ("png", "svg")]

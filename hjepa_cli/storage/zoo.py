@@ -6,14 +6,13 @@ editable install have it beside the package.
 """
 
 import dataclasses
-import difflib
 import re
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import DataError, MissingInputError, shell
+from hjepa_cli.errors import DataError, MissingInputError, meant, shell
 from hjepa_cli.storage import files, runs, seals
 from hjepa_cli.storage.checkpoints import MODEL_FILE, load_checkpoint
 
@@ -79,8 +78,7 @@ def resolve_model(name_or_path: str | Path) -> Path:
         )
     if path.exists():
         return path / MODEL_FILE if path.is_dir() else path
-    near = difflib.get_close_matches(text, models, n=1)
-    suggestion = f"did you mean '{near[0]}'?" if near else f"the zoo has {', '.join(models) or '-'}"
+    suggestion = meant(text, models).rstrip() or f"the zoo has {', '.join(models) or '-'}"
     raise MissingInputError(
         f"no model '{text}': neither a zoo name nor a file; {suggestion}", hint="hjepa models list"
     )

@@ -26,6 +26,7 @@ from hjepa_cli.wire.device import Device
 from hjepa_cli.wire.drive import LATE_STEPS
 from hjepa_cli.wire.runtime import Runtime, Singles
 
+CONNECT_S = 5.0  # that all devices together may take to be taken up
 AT_ONCE = 65_536  # datagrams that the bench takes in a step at most
 MOST_MISSING = 1e-3  # of all steps without a force: beyond it a score is of the machine
 LOST_THETA_RAD = 0.5  # a pole beyond it has fallen; no force brings it back
@@ -289,7 +290,6 @@ def real_time(
     server: Any,
     *,
     deadline: float = 0.8,
-    connect_s: float = 5.0,
     tick: Callable[[], None] = lambda: None,
     at_step: Callable[[int], None] = lambda k: None,
 ) -> BenchOutcome:
@@ -304,7 +304,6 @@ def real_time(
         socket: an unconnected, non-blocking UDP socket.
         server: the controller's address.
         deadline: share of a step after which its force is played.
-        connect_s: how long all may take to be taken up.
         tick: called after every step.
         at_step: called before step k, so that somebody may harm the server then.
 
@@ -334,7 +333,7 @@ def real_time(
                 pass  # as lost as on any other link
 
     steps, period_s = fleet.states.shape[0], fleet.devices[0].period_s
-    give_up_s = time.monotonic() + connect_s
+    give_up_s = time.monotonic() + CONNECT_S
     while not all(device.connected for device in fleet.devices):
         if time.monotonic() > give_up_s:
             lacking = sum(not device.connected for device in fleet.devices)

@@ -88,9 +88,9 @@ class Watched:
 
 
 class Replay:
-    """It reads a directory of pictures, in the order of their names, once or for ever."""
+    """It reads a directory of pictures, once and in the order of their names."""
 
-    def __init__(self, directory: Path, crop: Crop | None = None, *, repeat: bool = False) -> None:
+    def __init__(self, directory: Path, crop: Crop | None = None) -> None:
         require("PIL", "replaying pictures needs Pillow", "plot")
         names = sorted(path for path in directory.iterdir() if path.suffix.lower() in PICTURES)
         if not names:
@@ -98,7 +98,7 @@ class Replay:
                 f"{directory} holds no pictures ({', '.join(PICTURES)})",
                 hint="name a directory of pictures, a video file, a camera's number, or sim",
             )
-        self._paths: Iterator[Path] = iter(_endless(names) if repeat else names)
+        self._paths: Iterator[Path] = iter(names)
         self._crop = crop
 
     def read(self) -> Pixels | None:
@@ -205,8 +205,3 @@ def open_camera(name: str, crop: Crop | None, simulated: Callable[[], Camera]) -
     raise UsageError(
         f"--camera {name}: expected sim, a camera's number, a directory of pictures or a video file"
     )
-
-
-def _endless(paths: list[Path]) -> Iterator[Path]:
-    while True:
-        yield from paths

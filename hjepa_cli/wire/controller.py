@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from hjepa_cli.core.control.link import REMEMBERED_STEPS
 from hjepa_cli.wire import auth, protocol
 from hjepa_cli.wire.bundle import BUCKETS, Bundle
 from hjepa_cli.wire.protocol import Answer, Embedding, Forces, Hello
@@ -29,7 +30,6 @@ from hjepa_cli.wire.runtime import Runtime, Singles
 WINDOW_STEPS = 16  # forces in a datagram: its stride's, and those of the strides before
 REPEATS = 7  # of an answer, one a step: what loses it loses the next datagram too, perhaps
 LEAD_STEPS = 12  # that forces are computed ahead of the device, at least
-REMEMBERED_STEPS = 512  # of the forces that were sent; no embedding may be older
 CLOCK_INTERVALS = 3  # all of which a device must be slow in to be taken for slow
 FADED_STEPS = 512  # since its newest embedding: then a device is served after all others
 CLOCK_DATAGRAMS = 16  # of whose arrivals the earliest tells how late the others are
@@ -199,7 +199,6 @@ class Controller:
         key: shared with the devices.
         most_devices: sessions at a time; further devices are refused.
         timeout_s: a device that is silent for so long is forgotten.
-        lead_steps: forces are computed so far ahead of a device.
         random: makes 8 random bytes.
 
     Attributes:
@@ -216,12 +215,10 @@ class Controller:
         *,
         most_devices: int = 1024,
         timeout_s: float = 10.0,
-        lead_steps: int = LEAD_STEPS,
         random: Callable[[], bytes] = lambda: secrets.token_bytes(8),
     ) -> None:
         self.bundle, self._runtime, self._key = bundle, runtime, key
         self._most, self._timeout_s, self._random = most_devices, timeout_s, random
-        self._lead = max(lead_steps, 0)
         self.sessions: dict[int, Session] = {}
         self._pending: collections.OrderedDict[int, Session] = collections.OrderedDict()
         self._greeting = Bucket(*GREETING)
@@ -474,7 +471,7 @@ class Controller:
     def _queue(self, session: Session) -> None:
         """Note when a device's next stride is due: some steps before it needs it."""
         faded = session.planned - session.base > FADED_STEPS
-        ahead = self._lead + session.delay_steps()
+        ahead = LEAD_STEPS + session.delay_steps()
         when_s = session.clock.time_s(session.planned - ahead)
         session.ticket = next(self._tickets)  # older ones in the heaps are void
         heapq.heappush(self._faded if faded else self._due, (when_s, session.ticket, session))

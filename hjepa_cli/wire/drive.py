@@ -56,17 +56,16 @@ class Drive:
         self._source = protocol.PLANNED
         self._said_s: dict[str, float] = {}
         self._late_s: list[float] = []
-        self.sent = self.late_steps = 0
-        self.longest_local_steps = self._local_steps = 0
+        self.sent = self.late_steps = self._local_steps = 0
 
-    def connect(self, wait_s: float = CONNECT_S) -> None:
+    def connect(self) -> None:
         """Wait until the controller takes this device up.
 
         Raises:
             Unavailable: it does not answer, or has no place.
             DataError: it runs another model, or another version.
         """
-        until_s = time.monotonic() + wait_s
+        until_s = time.monotonic() + CONNECT_S
         while not self._device.connected:
             self._send(self._device.upkeep(time.monotonic()))
             self._receive(0, min(time.monotonic() + 0.02, until_s))
@@ -74,7 +73,7 @@ class Drive:
                 raise refusal(self._device, self._server)
             if time.monotonic() >= until_s and not self._device.connected:
                 raise Unavailable(
-                    f"no answer from {written(self._server)} within {wait_s:g} s",
+                    f"no answer from {written(self._server)} within {CONNECT_S:g} s",
                     hint="does a server run there, with the same --key? start one: "
                     "hjepa serve --model DIR",
                 )
@@ -152,7 +151,6 @@ class Drive:
             self._say(names[source])
             self._source = source
         self._local_steps = self._local_steps + 1 if source == protocol.LOCAL else 0
-        self.longest_local_steps = max(self.longest_local_steps, self._local_steps)
         silent_s = self._device.silent * self._device.period_s
         stopped = source == protocol.ZERO
         if stopped or (

@@ -142,16 +142,8 @@ def exported_method(model: Model, method: str | None) -> str:
     """Return the method to export: the one asked for, or the first that plans in strides.
 
     Raises:
-        UsageError: the model does not plan with it, or with any; or it is of a recorded plant, or
-            of frames of another size.
+        UsageError: the model does not plan with it, or with any.
     """
-    shape = camera_in(model.architecture).frame_shape
-    if isinstance(model.plant, Recorded) or shape != FRAME_SHAPE:
-        raise UsageError(
-            f"a model of plant {model.plant_name} and frames {shape} cannot be exported; the wire "
-            f"carries plants that can be simulated, seen in frames {FRAME_SHAPE}",
-            hint="hjepa models list",
-        )
     able = [
         name
         for name in methods_of(model)

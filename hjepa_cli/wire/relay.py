@@ -7,9 +7,11 @@ Recorded traces take the place of chance; the simulator reads the same file
 (:meth:`Trace.draws`).
 """
 
+import contextlib
 import dataclasses
 import heapq
 import itertools
+import resource
 import select
 import socket
 import time
@@ -28,6 +30,7 @@ from hjepa_cli.wire import protocol
 
 _KEY = 0x2E1A
 MOST_CLIENTS = 16_384
+SPARE_FILES = 32  # descriptors that clients' ports leave to everything else
 MOST_WAITING = 200_000  # datagrams in the relay
 LOST = "lost"
 
@@ -194,6 +197,7 @@ class Relay:
         self._poll = select.poll()
         self._poll.register(listening, select.POLLIN)
         self._of = {listening.fileno(): listening}
+        self._most_ports = _most_ports()
         self.counts: Counter[str] = Counter()
 
     def run(
@@ -212,7 +216,8 @@ class Relay:
                 soonest_s = self._waiting[0][0] if self._waiting else next_s
                 wait_s = min(soonest_s, next_s, until_s) - time.monotonic()
                 for number, _ in self._poll.poll(max(1e3 * wait_s, 0.0)):
-                    self._take(self._of[number], time.monotonic())
+                    if port := self._of.get(number):  # none: it has just made place for another
+                        self._take(port, time.monotonic())
         finally:
             for port in self._ports.values():
                 port.close()
@@ -230,7 +235,11 @@ class Relay:
             self.counts[f"{name}_lost"] += not times_s
             through = self._port_of(sender) if up else self._listening
             target = self._server if up else self._clients.get(port)
-            if target is None or len(self._waiting) + len(times_s) > MOST_WAITING:
+            if (
+                through is None
+                or target is None
+                or len(self._waiting) + len(times_s) > MOST_WAITING
+            ):
                 self.counts[f"{name}_full"] += 1
                 continue
             for at_s in times_s:
@@ -246,19 +255,45 @@ class Relay:
             except OSError:
                 self.counts["refused"] += 1
 
-    def _port_of(self, client: Any) -> socket.socket:
-        """Return the port that a client's datagrams leave by; the least used one makes place."""
+    def _port_of(self, client: Any) -> socket.socket | None:
+        """Return the port that a client's datagrams leave by; the least used one makes place.
+
+        ``None`` where the system has no descriptor for it even so.
+        """
         if client in self._ports:
             self._ports.move_to_end(client)
             return self._ports[client]
-        if len(self._ports) >= MOST_CLIENTS:
-            _, old = self._ports.popitem(last=False)
-            self._poll.unregister(old)
-            del self._of[old.fileno()], self._clients[old]
-            old.close()
-        port = socket.socket(self._family, socket.SOCK_DGRAM)
+        if len(self._ports) >= self._most_ports:
+            self._close_oldest()
+        if (port := self._new_port()) is None:
+            return None
         port.setblocking(False)
         self._ports[client], self._clients[port] = port, client
         self._of[port.fileno()] = port
         self._poll.register(port, select.POLLIN)
         return port
+
+    def _new_port(self) -> socket.socket | None:
+        try:
+            return socket.socket(self._family, socket.SOCK_DGRAM)
+        except OSError:  # others take descriptors, too
+            if not self._ports:
+                return None
+        self._close_oldest()
+        with contextlib.suppress(OSError):
+            return socket.socket(self._family, socket.SOCK_DGRAM)
+        return None
+
+    def _close_oldest(self) -> None:
+        _, port = self._ports.popitem(last=False)
+        self._poll.unregister(port)
+        del self._of[port.fileno()], self._clients[port]
+        port.close()
+
+
+def _most_ports() -> int:
+    """Return how many clients may have a port, of the files that this process may open."""
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files == resource.RLIM_INFINITY:
+        return MOST_CLIENTS
+    return min(MOST_CLIENTS, max(files - SPARE_FILES, 1))

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from hjepa_cli.core.arrays import Pixels
+from hjepa_cli.core.arrays import Pixels, array_from
 from hjepa_cli.core.plants.frames import FRAME_SHAPE
-from hjepa_cli.errors import Unavailable, require
+from hjepa_cli.errors import ArrayError, Unavailable, require
 from hjepa_cli.wire.bundle import Bundle
 from hjepa_cli.wire.runtime import Runtime
 
@@ -81,7 +81,7 @@ def _array(found: dict[str, Any]) -> Any:
         if "__npgeneric__" in found:
             return dtype.type(found["data"])
         return np.frombuffer(found["data"], dtype).reshape(found["shape"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, SyntaxError, TypeError, ValueError) as error:
         raise BadObservation(f"an array that is not what it says: {error}") from None
 
 
@@ -102,15 +102,22 @@ class Client:
         if not isinstance(observation, dict):
             raise BadObservation("expected a map with the picture under " + " or ".join(IMAGE_KEYS))
         found = [observation[key] for key in IMAGE_KEYS if key in observation]
-        pictures: NDArray[Any] = np.asarray(found[0]) if found else np.zeros(0)
+        try:
+            pictures: NDArray[Any] = array_from(found[0] if found else [], "the picture")
+            begins_anew = bool(observation.get("reset"))
+        except ArrayError as error:
+            raise BadObservation(error.message) from None
+        except ValueError:
+            raise BadObservation("reset is an array; expected true or false") from None
         if pictures.shape == FRAME_SHAPE:
             pictures = pictures[None]
-        if pictures.dtype != np.uint8 or pictures.shape[1:] != FRAME_SHAPE:
+        fitting = pictures.dtype == np.uint8 and pictures.shape[1:] == FRAME_SHAPE
+        if not fitting or not len(pictures):
             raise BadObservation(
                 f"expected a picture {list(FRAME_SHAPE)} of uint8, RGB, or several [n, …] with the "
                 f"newest last, under {' or '.join(IMAGE_KEYS)}"
             )
-        if observation.get("reset"):
+        if begins_anew:
             self._seen.clear()
         for picture in pictures:
             while len(self._seen) < self._seen.maxlen - 1:  # type: ignore[operator]

@@ -47,6 +47,49 @@ def test_levels_part_with_every_stride_and_meet_at_a_packet():
     )
 
 
+class Late(Straight):
+    def follow(self, z, forces_n, ages):
+        return z + torch.from_numpy(ages).float()[:, None]
+
+
+def levels_of(controller):
+    return TwoLevels(controller, lambda z, forces_n: z + 1.5, lambda z: z[:, 0], 20.0)
+
+
+def test_before_a_late_packet_comes_levels_are_not_apart():
+    both = levels_of(StrideController(Late(), 2))
+    nobody, first = np.zeros(2, dtype=bool), np.array([True, False])
+    for _ in range(4):
+        assert (both.act(nobody, None, np.zeros(0, int)) == 0).all() and (both.apart == 0).all()
+    both.act(first, torch.zeros(1, 1), np.array([2]))
+    for _ in range(2):
+        both.act(nobody, None, np.zeros(0, int))
+    assert both.apart * 40 == pytest.approx([1.5, 0.0])  # who is not heard yet has no levels
+
+
+def test_a_packet_that_is_kept_back_is_no_start_of_either_level():
+    class KeepsBack:
+        """Passes the first step's packets on, and no others."""
+
+        def __init__(self, devices):
+            self.pass_on = lambda *first: self._later(*first)
+
+        def _later(self, *first):
+            self.pass_on = lambda delivered, packets, ages: (delivered & False, None, ages)
+            return first
+
+    checked = levels_of(StrideController(Straight(), 2, check=KeepsBack))
+    undisturbed = levels_of(StrideController(Straight(), 2))
+    everybody = np.ones(2, dtype=bool)
+    for k in range(9):
+        packets = torch.zeros(2, 1) if k in (0, 4) else None
+        forces_n = checked.act(everybody if k in (0, 4) else ~everybody, packets)
+        arrives = packets if k == 0 else None
+        expected_n = undisturbed.act(everybody if k == 0 else ~everybody, arrives)
+        assert np.array_equal(forces_n, expected_n)
+        assert np.array_equal(checked.apart, undisturbed.apart), k
+
+
 def devices(count, slope, seed):
     """Errors whose scale follows the levels' distance with a slope, over ages."""
     random = np.random.default_rng(seed)

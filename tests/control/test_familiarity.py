@@ -7,6 +7,7 @@ from scipy import stats
 
 from hjepa_cli.api import load_model
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.control import drivers
 from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.drivers import build_driver, check_of
 from hjepa_cli.core.control.familiarity import PacketCheck, fit_familiarity
@@ -126,6 +127,12 @@ def test_garbage_is_flagged_and_ordinary_packets_are_not(model) -> None:
         assert acted_on.flagged is None
         assert found.score.mean() > 0.85 * nominal.score.mean()
         assert found.score.mean() > acted_on.score.mean()
+
+
+def test_off_no_coder_is_fitted(model, monkeypatch) -> None:
+    monkeypatch.setattr(drivers, "coder_of", lambda *ignored: pytest.fail("fitted in vain"))
+    plain = load_settings(flags={"protocol.payload": "pca-16x3"})
+    assert check_of(plain, model) is None
 
 
 def test_off_there_is_no_check_and_digests_know_what_it_is_fitted_to(model) -> None:

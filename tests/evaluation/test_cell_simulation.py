@@ -10,12 +10,15 @@ import torch
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import LastForce, StrideController
+from hjepa_cli.core.control.disagreement import LevelDisagreement, TwoLevels
+from hjepa_cli.core.control.drivers import Driver
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable
 from hjepa_cli.core.control.loop import Draws, every_step, gap_schedule, simulate
 from hjepa_cli.core.control.methods.true_state import true_state_driver
 from hjepa_cli.core.evaluation.cell_simulation import (
     CHUNK_STEPS,
     CellOutcome,
+    Outbox,
     measure_growth,
     simulate_cell,
     streamed_draws,
@@ -133,6 +136,40 @@ def test_a_late_link_is_late_in_the_cell_as_it_is_alone(name):
     ours = cell(name, 9, access(blocks=9), **link)
     assert np.array_equal(ours.cost, given(name, every_step(300, 9), **link).cost[0])
     assert not np.array_equal(ours.cost, cell(name, 9, access(blocks=9)).cost)
+
+
+def test_two_levels_meet_a_late_link():
+    """The scheduler asks how far they are apart before the first packet has come."""
+
+    class Standing:
+        stride = 2
+
+        def plan(self, z):
+            return z[:, :1].expand(-1, 2), z
+
+        def follow(self, z, forces_n, ages):
+            return z
+
+    def drives(devices):
+        controller = StrideController(Standing(), devices)
+        return TwoLevels(controller, lambda z, forces_n: z + 0.1, lambda z: z[:, 0], 20.0)
+
+    one = Driver("levels", lambda seen: torch.zeros(len(seen), 1), drives, drives, 2064, "levels")
+    levels = LevelDisagreement(ANY_GROWTH, np.full(20, 0.01), 0.5)
+    slots = protocol(steps=30, delay_steps=4)
+    found = simulate_cell(DESKTOP, slots, 0, 6, access("whittle", levels=levels), one)
+    assert np.isfinite(found.cost).all()
+
+
+def test_samples_under_way_are_not_those_that_are_kept():
+    everybody = np.ones(3, dtype=bool)
+    for make in (np.zeros, torch.zeros):
+        outbox = Outbox()
+        under_way = outbox.deliver(make((3, 2)), everybody, everybody)
+        assert outbox.deliver(make((3, 2)) + 1, everybody, ~everybody) is None
+        assert (under_way == 0).all()
+        copies = outbox.deliver(None, ~everybody, everybody)
+        assert (copies == 1).all()
 
 
 def test_age_based_schedulers_without_fading_are_round_robin():

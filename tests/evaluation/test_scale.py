@@ -42,6 +42,7 @@ def stage(tmp_path, monkeypatch):
             asked=(checkpoint, dataset),
             skipped=lambda methods: skipped,
             measurable=lambda methods: [name for name in methods if name in ENTRIES],
+            of=lambda method: SimpleNamespace(settings=settings, model=None),
             inputs=lambda **flags: flags,
         )
 
@@ -51,6 +52,10 @@ def stage(tmp_path, monkeypatch):
         model = {"checkpoint": "model", "checkpoints": {}}
         return model | {"methods": found, "source": "curves of the test"}
 
+    def build_driver(name, settings, model):
+        return SimpleNamespace(bits_per_transmission=ENTRIES[name]["bits_per_transmission"])
+
+    monkeypatch.setattr(scale_by_formula, "build_driver", build_driver)
     monkeypatch.setattr(scale_by_formula, "open_measurable", open_measurable)
     monkeypatch.setattr(scale_by_formula, "curves_for", curves_for)
 
@@ -110,6 +115,19 @@ def test_raw_frames_are_as_late_as_they_take_slots(stage, monkeypatch):
     assert stage.curves[1][2]["methods"] == ["supervised-2"]
     wide = {"radio.bandwidth_hz": 1e9}  # a slot carries a whole packet
     assert stage(methods=("supervised-2",), config=wide)["rows"][0]["delay_steps"] == 0
+
+
+@pytest.mark.parametrize("start", ["steady", "paper"])
+def test_a_stated_gap_is_charged_as_the_protocol_starts(tmp_path, monkeypatch, start):
+    """⌊D c⌋ of 320 steps; K steps from the start on have 1 − 1/D packets more."""
+    monkeypatch.chdir(tmp_path)
+    settings = load_settings(flags={"radio.snr_db": "20", "protocol": start})
+    quiet = Screen(True, stdout=io.StringIO(), stderr=io.StringIO())
+    monkeypatch.setattr(scale, "draw", lambda *ignored: [])
+    [row] = scale.run(settings, quiet, tolerance_steps=320, checkpoint="desktop-h4m2l1")["rows"]
+    c, steps = 20e6 * 1e-3 * math.log2(101) / 2064, settings.protocol.steps
+    extra = 0 if start == "steady" else 1 - 1 / 320
+    assert row["devices"] == math.floor(c * steps / (steps / 320 + extra))
 
 
 def test_gains_stand_beside_the_papers(stage):

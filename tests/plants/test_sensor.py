@@ -10,10 +10,11 @@ import pytest
 from hjepa_cli.config.checks import check_settings
 from hjepa_cli.config.schema import CameraSettings, SensorSettings, Settings
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.plants import corruptions
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.named import camera_of, plant, seen_as_trained, sensor_in
-from hjepa_cli.core.plants.sensor import OPEN, Sensed, rates_of
+from hjepa_cli.core.plants.sensor import OPEN, Sensed, on_the_ground, rates_of
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import UsageError
 
@@ -84,6 +85,17 @@ def test_stains_are_behind_what_is_seen():
     assert loss.min() >= 0 and loss[ground].max() == 40 and loss[ground].min() == 0
     both = ground.all(0)  # the stains do not move with the plant
     np.testing.assert_array_equal(loss[0][both], loss[1][both])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_ground_is_the_darkest_channel_to_the_last_bit(monkeypatch, channels):
+    pictures = np.random.default_rng(0).uniform(0, 255, (2, 1, 8, 16, channels)).astype(np.float32)
+    grounds = []
+    monkeypatch.setattr(
+        corruptions, "texture", lambda ground, *rest: (grounds.append(ground), ground)[1]
+    )
+    assert np.array_equal(on_the_ground(pictures, 9.0), pictures)
+    np.testing.assert_array_equal(grounds[0], pictures.min(axis=-1, keepdims=True))
 
 
 @pytest.mark.parametrize("exposure_ms", [5.0, 20.0])

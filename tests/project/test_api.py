@@ -11,6 +11,7 @@ import torch
 from command_line import ENVIRONMENT, ROOT
 from played import play
 from test_evaluate import untrained
+from test_model_set import saved
 
 import hjepa_cli
 from hjepa_cli.config.settings import load_settings
@@ -218,6 +219,25 @@ def test_a_late_method_is_one_over_a_late_link(model):
     assert np.abs(forces["hjepa"][3:] - forces["hold"][3:]).max() > 1e-3
     never = hjepa_cli.drive("hold-true+99999999999", devices=2, settings=QUICK)
     assert (never["forces_n"] == 0).all()
+
+
+def test_a_model_brings_its_pictures_and_its_law(tmp_path):
+    law = [-9.0, -9.0, -70.0, -9.0]
+    flags = {"camera.height_px": 32, "camera.width_px": 64, "camera.grey": True}
+    trained = load_settings(flags=flags | {"encoder.hidden": 8, "control.gains_n": law})
+    path = saved(tmp_path / "model.safetensors", trained, kind="flat", h=1, m=1, l=1, hidden=8)
+    small = hjepa_cli.load_model(path)
+    for method in ("hold", "zero"):
+        driven = hjepa_cli.drive(method, model=small, devices=2, settings=QUICK)
+        assert np.isfinite(driven["forces_n"]).all()
+    sampled = QUICK | {"collect.trajectories": 3, "collect.test_trajectories": 2}
+    hjepa_cli.drive("state-kf", model=small, devices=2, settings=sampled | {"collect.steps": 40})
+    with_law, own, other = (
+        hjepa_cli.drive("hold-true", model=one, devices=2, settings=QUICK | changes)["forces_n"]
+        for one, changes in ((small, {}), (None, {"control.gains_n": law}), (None, {}))
+    )
+    np.testing.assert_array_equal(with_law, own)
+    assert (with_law != other).any()
 
 
 def test_stages_return_their_documents_and_print_nothing(capsys):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command_line import block
 from test_evaluate import Output, elsewhere, quick_encoder, small, untrained
+from test_model_set import of_method, saved
 
 from hjepa_cli import plugins
 from hjepa_cli.compute.executors import placed
@@ -23,6 +24,7 @@ from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.stages import evaluate, scale
+from hjepa_cli.stages.scale_by_formula import ByFormula
 
 __all__ = ["elsewhere", "quick_encoder"]  # fixtures
 
@@ -154,6 +156,43 @@ def test_curves_expire_with_a_codec(tmp_path: Path) -> None:
     first = Digest.of("model", tiny(("hold",), payload="signs"))
     loaded(tmp_path, CODEC + "# changed\n")
     assert Digest.of("model", tiny(("hold",), payload="signs")).protocol != first.protocol
+
+
+FRAMES = """
+from hjepa_cli.core.control.drivers import Driver, last_force
+from hjepa_cli.core.control.methods.method import Method
+from hjepa_cli.core.control.sensors import camera_sensor
+from hjepa_cli.core.plants.conditions import actual_camera
+from hjepa_cli.plugins import register
+
+def build(settings, model):
+    sensor, drives = camera_sensor(model, actual_camera(settings)), last_force(model)
+    return Driver("my-frames", sensor, drives, drives, 5 * 32 * 64, "my-frames")
+
+register(Method("my-frames", "frames", build, offered=lambda architecture, plant: True))
+"""
+
+
+def test_frames_are_as_late_as_their_driver_s_bits_take(tmp_path: Path) -> None:
+    """Of whatever name the method is, and whatever the size of the model's pictures."""
+    loaded(tmp_path, FRAMES)
+    camera = {"camera.height_px": 32, "camera.width_px": 64, "camera.grey": True}
+    trained = of_method("supervised", **camera)
+    checkpoint = saved(tmp_path / "model.safetensors", trained)
+    settings = tiny(("supervised-2", "my-frames"))
+    radio = dataclasses.replace(settings.radio, bandwidth_hz=1e6)
+    settings = dataclasses.replace(settings, radio=radio)
+    counting = ByFormula(
+        plugins.LAWS["duty"], settings, Output().screen, checkpoint=str(checkpoint)
+    )
+    per_slot = 1e3 * np.log2(101)
+    slots = {
+        name: int(np.ceil(bits * 32 * 64 / per_slot))
+        for name, bits in (("supervised-2", 2 * 8), ("my-frames", 5))
+    }
+    assert counting.measured_methods([20.0]) == {
+        20.0: [f"{name}+{late}" for name, late in slots.items()]
+    }
 
 
 FAMILY = """

@@ -72,6 +72,20 @@ def test_loops_tell_the_truth_beside_packets_in_noise(workplace: Path) -> None:
     assert len(other.true) != len(heard.true) or not torch.equal(other.true, heard.true)
 
 
+def test_packets_and_truths_are_of_one_moment_whatever_the_link_is(workplace: Path) -> None:
+    checkpoint = load_checkpoint(workplace / "run" / "model.safetensors")
+    posterior = load_modules(checkpoint)["posterior"]
+    model = Model.load(checkpoint.path, "cpu")
+    late = {
+        f"protocol__{key}": value
+        for key, value in (("delay_steps", 3), ("jitter_steps", 2), ("downlink_loss", 0.3))
+    }
+    heard = listen(model, posterior, small("desktop", **FUSION, **late), 0)
+    ideal = listen(model, posterior, settings(), 0)
+    for name in ("predicted", "packets", "true"):
+        assert torch.equal(getattr(heard, name), getattr(ideal, name)), name
+
+
 def test_only_the_posterior_is_trained(workplace: Path) -> None:
     before = load_checkpoint(workplace / "model.safetensors").tensors
     after = load_checkpoint(workplace / "run" / "model.safetensors")

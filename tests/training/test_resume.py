@@ -275,6 +275,32 @@ def test_each_part_of_the_state_matters(
         assert model.read_bytes() != (workplace / "train-encoder" / model.name).read_bytes()
 
 
+def test_the_gpu_s_random_numbers_are_part_of_the_state(
+    workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is none here: stand-ins take the place of torch's calls."""
+    out, state = tmp_path / "run", torch.arange(16, dtype=torch.uint8)
+    train = trainer("train-encoder", workplace, device="cpu")
+    with monkeypatch.context() as patched:
+        patched.setattr(torch.cuda, "is_initialized", lambda: True)
+        patched.setattr(torch.cuda, "get_rng_state", lambda: state)
+        signal_after(patched, 3)
+        with pytest.raises(Interrupted):
+            train(out)
+    saved = load_checkpoint(out / PROGRESS_FILE)
+    kept = {name: of for name, of in saved.tensors.items() if name != progress.CUDA_STREAM}
+    older, elsewhere = (Path(shutil.copytree(out, tmp_path / name)) for name in ("older", "cpu"))
+    save_checkpoint(older / PROGRESS_FILE, kept, saved.metadata)
+    given: list[torch.Tensor] = []
+    monkeypatch.setattr(torch.cuda, "set_rng_state", given.append)
+    train(elsewhere)  # where there is no GPU
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    train(older)
+    assert not given
+    train(out)
+    assert len(given) == 1 and torch.equal(given[0], state)
+
+
 def test_the_teacher_of_hardening_is_part_of_the_state(
     workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,13 +1,17 @@
 """A relay does to datagrams what its flags say, by the closed forms of their statistics."""
 
+import contextlib
+import errno
 import socket
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
 
 from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.wire import relay as relay_module
 from hjepa_cli.wire.relay import QUEUE_S, Direction, Impairment, Relay, Trace
 from hjepa_cli.wire.server import open_socket
 
@@ -91,6 +95,48 @@ def test_what_is_no_trace_is_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(DataError, match=r"trace"):
         Trace.read(path)
+
+
+@pytest.mark.parametrize("limited", ["known", "met"])
+def test_more_clients_than_files_are_passed_on_by_ports_that_make_place(monkeypatch, limited):
+    """Whether the limit is the process's own or others have taken what there is."""
+    opened, real, most = [], socket.socket, 3
+
+    class Limited(real):
+        def __init__(self, *arguments):
+            opened[:] = [one for one in opened if one.fileno() >= 0]
+            if len(opened) == most:
+                raise OSError(errno.EMFILE, "too many open files")
+            super().__init__(*arguments)
+            opened.append(self)
+
+    with (
+        contextlib.closing(open_socket(("127.0.0.1", 0))) as server,
+        contextlib.closing(open_socket(("127.0.0.1", 0))) as listening,
+    ):
+        if limited == "known":
+            files = relay_module.SPARE_FILES + most
+            monkeypatch.setattr(relay_module.resource, "getrlimit", lambda kind: (files, files))
+        ideal = [Direction(Impairment(), 0, way) for way in (0, 1)]
+        relay = Relay(listening, server.getsockname(), socket.AF_INET, *ideal)
+        senders = [real(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(9)]
+        named = types.SimpleNamespace(**vars(socket) | {"socket": Limited})
+        monkeypatch.setattr(relay_module, "socket", named)
+        for number, sender in enumerate(senders):
+            sender.sendto(bytes([number]), listening.getsockname())
+        relay.run(time.monotonic() + 0.2)
+        got = set()
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                got |= set(server.recv(10))
+        assert got == set(range(9)) and len(relay._ports) <= most
+        most = 0  # and where there is none at all, a datagram is lost and nothing ends
+        relay = Relay(listening, server.getsockname(), socket.AF_INET, *ideal)
+        senders[0].sendto(b"x", listening.getsockname())
+        relay.run(time.monotonic() + 0.05)
+        assert relay.counts["up"] == relay.counts["up_full"] == 1
+        for sender in senders:
+            sender.close()
 
 
 def test_two_clients_over_real_sockets():

@@ -61,6 +61,8 @@ def test_arrays_go_both_ways(dtype, shape):
         msgpack.packb({"__ndarray__": True, "data": b"12", "dtype": "O", "shape": [1]}),
         msgpack.packb({"__ndarray__": True, "data": b"1", "dtype": "u1", "shape": [-5, 2**60]}),
         msgpack.packb({"__ndarray__": True, "data": b"1", "dtype": [], "shape": 1}),
+        msgpack.packb({"__ndarray__": True, "data": b"1", "dtype": ">,2", "shape": [1]}),
+        msgpack.packb({"__npgeneric__": True, "data": 1000, "dtype": "|u1"}),
     ],
 )
 def test_what_is_no_message_is_refused(data):
@@ -127,11 +129,40 @@ def test_a_connection_remembers_pictures_that_are_further_apart():
         {"image": np.zeros(FRAME_SHAPE, np.float32)},
         {"image": np.zeros((64, 64, 3), np.uint8)},
         {"image": "picture"},
+        {"image": np.zeros((0, *FRAME_SHAPE), np.uint8)},
+        {"image": np.zeros(FRAME_SHAPE, np.uint8), "reset": np.zeros(2, bool)},
     ],
 )
 def test_observations_without_a_picture_are_refused(observation):
     with pytest.raises(BadObservation, match="expected"):
         Client(Bundle, Runtime()).act(observation)
+
+
+def test_a_ragged_picture_is_refused():
+    with pytest.raises(BadObservation, match="the picture is no array"):
+        Client(Bundle, Runtime()).act({"image": [[1, 2], [3]]})
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        {"image": [[1, 2], [3]]},
+        {"image": {"__ndarray__": True, "data": b"", "dtype": "|u1", "shape": [0, 64, 128, 3]}},
+        {"image": {"__npgeneric__": True, "data": -1, "dtype": "|u1"}},
+    ],
+)
+def test_a_bad_observation_is_one_line_and_a_code(sent, caplog):
+    connect = pytest.importorskip("websockets.sync.client").connect
+    closed = pytest.importorskip("websockets.exceptions").ConnectionClosed
+    with websocket.door("127.0.0.1", 0, Bundle, Runtime()) as (host, port):
+        with connect(f"ws://{host}:{port}", compression=None) as connection:
+            connection.recv()
+            connection.send(msgpack.packb(sent))
+            assert len(connection.recv().splitlines()) == 1
+            with pytest.raises(closed):
+                connection.recv()
+            assert connection.close_code == 1003
+    assert not caplog.records
 
 
 def test_a_client_over_a_real_socket():

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats, Integers
+from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.familiarity import PacketCheck
 from hjepa_cli.core.control.link import AHEAD_STEPS, REMEMBERED_STEPS, SentForces
 from hjepa_cli.core.networks.planning import Planner, Reaction
@@ -91,7 +92,11 @@ class _Strides:
 
 
 class StrideController(_Strides):
-    """Plays a planner for n devices: a stride starts where the last one led to, or at a packet."""
+    """Plays a planner for n devices: a stride starts where the last one led to, or at a packet.
+
+    Attributes:
+        taken: whose stride started anew at a packet in the last step [n].
+    """
 
     def __init__(
         self,
@@ -104,6 +109,7 @@ class StrideController(_Strides):
         super().__init__(planner.stride, devices, action_shape)
         self._planner, self._starts = planner, self._z
         self.check = check(devices) if check else None
+        self.taken = np.zeros(devices, dtype=bool)
 
     def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are embeddings [delivered.sum(), D].
@@ -112,6 +118,7 @@ class StrideController(_Strides):
         """
         if self.check is not None:
             delivered, packets, ages = self.check.pass_on(delivered, packets, ages)
+        self.taken = delivered
         return super().act(delivered, packets, ages)
 
     def _take(self, delivered: Bools, packets: Tensor, ages: Integers | None) -> Tensor:
@@ -139,7 +146,7 @@ class StrideController(_Strides):
     @property
     def reached(self) -> tuple[Bools, Tensor]:
         """Return whose stride is over [n], and the embeddings [n, D] that strides lead to."""
-        return self._phase == self._stride, self._z
+        return self._over, self._z
 
     @property
     def belief(self) -> tuple[Tensor, Tensor, Floats]:
@@ -357,5 +364,5 @@ class Oracle:
         return states
 
     def _moved(self, states: Floats, forces_n: Floats) -> Floats:
-        # ±50 is where the loop clips true states too: a lost pole must not overflow.
-        return np.clip(self._advance(states, forces_n), -50.0, 50.0)
+        # The loop clips true states there, too: a lost pole must not overflow.
+        return np.clip(self._advance(states, forces_n), -STATE_LIMIT, STATE_LIMIT)

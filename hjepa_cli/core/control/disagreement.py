@@ -51,14 +51,17 @@ class TwoLevels:
     def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the controller's forces [n, *A], and let the second level follow them."""
         forces_n = self._controller.act(delivered, packets, ages)
-        if packets is not None:
+        if not len(self._apart):
+            self._apart = np.zeros(len(delivered))
+        taken, (starts, _, _) = self._controller.taken, self._controller.belief
+        if taken.any():
             if not len(self._beside):
-                self._beside = packets.new_zeros(len(delivered), packets.shape[1])
-                self._apart = np.zeros(len(delivered))
-            rows = torch.from_numpy(delivered)
-            starts, _, _ = self._controller.belief
+                self._beside = torch.zeros_like(starts)
+            rows = torch.from_numpy(taken)
             self._beside[rows] = starts[rows]  # the packets, at the present
-            self._apart[delivered] = 0.0
+            self._apart[taken] = 0.0
+        if not len(self._beside):
+            return forces_n  # late packets: nobody has been heard yet
         self._beside = self._step(self._beside, torch.from_numpy(forces_n).float())
         over, reached = self._controller.reached
         if over.any():

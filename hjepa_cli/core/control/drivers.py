@@ -26,6 +26,7 @@ from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera
+from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.named import camera_in, plant, seen_as_trained
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, UsageError, choices
@@ -80,7 +81,7 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
     if METHODS[name].needs_model and (model is None or name not in methods_of(model)):
         raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")
     if model:
-        settings = seen_as_trained(settings, model.metadata["settings"])
+        settings = as_trained(settings, model)
     driver: Driver = METHODS[name].build(settings, model)
     if not driver.uses_link:
         return dataclasses.replace(driver, name=late(name, steps))
@@ -93,6 +94,25 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
     if steps or not settings.protocol.ideal_link:  # a packet at every step leaves much to predict
         driver = dataclasses.replace(driver, reactive=driver.controller, family=driver.name)
     return driver
+
+
+def as_trained(settings: Settings, model: Model) -> Settings:
+    """Return settings with the law that a model learned, and its pictures.
+
+    A ceiling is nobody's to learn: that of the settings stays where the model brings none. A sensor
+    that they set stays too.
+
+    Raises:
+        DataError: the model holds no valid law.
+    """
+    record = model.metadata["settings"]
+    law = control_of(record, model.digest)
+    ceiling = law.ceiling_gains_n or settings.control.ceiling_gains_n
+    return dataclasses.replace(
+        seen_as_trained(settings, record),
+        control=dataclasses.replace(law, ceiling_gains_n=ceiling),
+        camera=camera_in(model.architecture),
+    )
 
 
 def embedding_driver(
@@ -136,9 +156,10 @@ def coder_of(settings: Settings, model: Model) -> Coder:
 @functools.lru_cache(maxsize=2)  # methods of one run share it
 def check_of(settings: Settings, model: Model) -> Callable[[int], PacketCheck] | None:
     """Return what makes a check of packets, fitted to a model's; ``None`` where there is none."""
-    protocol, coder = settings.protocol, coder_of(settings, model)
+    protocol = settings.protocol
     if not protocol.false_alarm:
         return None
+    coder = coder_of(settings, model)
     train, test = (
         coder.send(sampled_embeddings(model, settings, split)) for split in ("train", "test")
     )

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
+from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.embedded_split import embed_split
 from hjepa_cli.core.control.link import REMEMBERED_STEPS
-from hjepa_cli.core.control.loop import STATE_LIMIT, noise_per_step
+from hjepa_cli.core.control.loop import noise_per_step
 from hjepa_cli.core.networks.health import fit_probe, read_probe
 from hjepa_cli.core.plants.system import Teacher
 

@@ -28,6 +28,7 @@ from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels
+from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
@@ -35,7 +36,6 @@ from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import NumericalError, UsageError
 
 LOOP_VERSION = 5  # raise it whenever a measured number changes: cached curves then expire
-STATE_LIMIT = 50.0  # states are clipped here instead of ending a run: a fallen pole keeps falling
 _DRAWS_KEY, _LINK_KEY = 0xD4A5, 0x11A7
 GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples, modulo 1, spread evenly however many are taken
 

@@ -112,7 +112,7 @@ class Outbox:
         ``fresh`` are those [sampled.sum(), ...] of the devices that sample in this slot [N].
         """
         if self._kept is None:  # of everybody: all are heard in the first slot
-            self._kept = fresh
+            self._kept = fresh[np.arange(len(fresh))]  # a copy: those may still be under way
         if np.array_equal(sampled, arrived):
             return fresh
         if fresh is not None:

@@ -6,14 +6,13 @@ the sensor, what is sent. Controllers, teachers and the oracle's equations stay 
 """
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.plants import corruptions
 from hjepa_cli.core.plants.corruptions import Corrupt
-from hjepa_cli.errors import UsageError
+from hjepa_cli.errors import UsageError, choices
 
 AUDIT, ALL = "audit", "all"
 
@@ -261,10 +260,6 @@ def described(names: Iterable[str] = CONDITIONS) -> list[list[Any]]:
 
 def _named(name: str) -> Condition:
     if name not in CONDITIONS:
-        near = difflib.get_close_matches(name, CONDITIONS, n=1)
-        meant = f"did you mean '{near[0]}'? " if near else ""
-        raise UsageError(
-            f"unknown condition '{name}'; {meant}choose from {', '.join(CONDITIONS)}, or {AUDIT} "
-            f"or {ALL}"
-        )
+        known = choices(name, CONDITIONS)
+        raise UsageError(f"unknown condition '{name}'; {known}, or {AUDIT} or {ALL}")
     return CONDITIONS[name]

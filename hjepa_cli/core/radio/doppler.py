@@ -15,6 +15,7 @@ from scipy.special import j0
 
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.control.loop import GOLDEN
 from hjepa_cli.errors import UsageError
 
 LIGHT_M_S = 299_792_458.0
@@ -22,7 +23,6 @@ SINUSOIDS, TAP_SINUSOIDS = 64, 16  # of a tap
 COHERENCE = 0.423  # coherence time · f_D, where the autocorrelation has come down to a half
 SIGHT_DOPPLER = 0.7  # of the line of sight, in f_D (TR 38.901, clause 7.7.2)
 SAMPLE_HZ = 720e3  # two PRBs at 30 kHz: between samples of the band at most
-GOLDEN = (np.sqrt(5) - 1) / 2
 _DOPPLER_KEY = 0xD0B
 
 

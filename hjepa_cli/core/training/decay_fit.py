@@ -14,9 +14,10 @@ import numpy as np
 
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats
+from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.controllers import LastForce, Oracle
 from hjepa_cli.core.control.link import InFlight
-from hjepa_cli.core.control.loop import STATE_LIMIT, Draws, Sensor, gap_schedule, simulate
+from hjepa_cli.core.control.loop import Draws, Sensor, gap_schedule, simulate
 from hjepa_cli.core.control.sensors import true_state
 from hjepa_cli.core.plants.linear import gains_at_rest
 from hjepa_cli.core.plants.system import System, Teacher

@@ -43,7 +43,8 @@ def listen(model: Model, posterior: nn.Module, settings: Settings, number: int) 
     """Drive devices over a link, a half of them in the settings' conditions, the others in none.
 
     Packets of the first half are also quantised as the settings say. The loops of each ``number``
-    are others; gaps differ from device to device and packet to packet.
+    are others; gaps differ from device to device and packet to packet. Packets come on time, even
+    where the settings' are late: each is paired with the truth of its own moment.
     """
     halves = [_listen(model, posterior, settings, number, exact=exact) for exact in (False, True)]
     names = [field.name for field in dataclasses.fields(Heard)]
@@ -56,7 +57,7 @@ def _listen(
     options, gaps = settings.fusion, settings.protocol.gaps
     protocol = dataclasses.replace(settings.protocol, warmup_steps=0, steps=options.loop_steps)
     seed = settings.seed + SEARCH_SEED + 2 * number + exact
-    draws = Draws.make(protocol, options.devices, seed)
+    draws = Draws.make(protocol, options.devices, seed).on_device
     # A device's mean gap lies, by its logarithm, evenly between short gaps and those of the middle.
     shortest, longest = max(gaps[min(1, len(gaps) - 1)] / 2, 1.0), gaps[len(gaps) // 2]
     share = generator(seed, GAP_KEY).uniform(size=options.devices)

@@ -13,7 +13,7 @@ import numpy as np
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings, TuneSettings
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.control.loop import STATE_LIMIT
+from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.plants.control_law import LinearLaw
 from hjepa_cli.core.plants.linear import gains_at_rest
 from hjepa_cli.core.plants.system import System

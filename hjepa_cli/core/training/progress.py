@@ -25,6 +25,7 @@ from hjepa_cli.storage.runs import Run, differences
 PROGRESS_FILE = "progress.safetensors"
 SAVE_EVERY_S = 60.0
 TORCH_STREAM = "torch-stream"  # the state of torch's own generator, among the tensors
+CUDA_STREAM = "cuda-stream"  # that of the GPU, in runs that compute on one
 METRICS_ROWS = "metrics-rows"  # the text of metrics.csv, likewise: it may outgrow a header
 MOST_THREADS = 4096
 
@@ -158,6 +159,8 @@ class Progress:
             for name, tensor in state.state_dict().items()
         }
         tensors[TORCH_STREAM] = torch.get_rng_state().numpy()
+        if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]  # dropout draws there
+            tensors[CUDA_STREAM] = torch.cuda.get_rng_state().numpy()
         tensors[METRICS_ROWS] = np.array(bytearray(self._record.metrics.encode()), np.uint8)
         state, seconds = jsonable(stream.bit_generator.state), round(self.seconds, 2)
         threads, settings = torch.get_num_threads(), self._record.settings
@@ -197,6 +200,9 @@ class Progress:
         assert self._saved is not None
         try:
             torch.set_rng_state(self._tensors.pop(TORCH_STREAM))
+            on_gpu = self._tensors.pop(CUDA_STREAM, None)  # not there in files of older versions
+            if on_gpu is not None and torch.cuda.is_available():
+                torch.cuda.set_rng_state(on_gpu)
             stream.bit_generator.state = self._saved.stream
             for part, state in parts.items():
                 prefix = f"{part}."

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.control.loop import STATE_LIMIT
+from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.networks.reflex import Reflex
 from hjepa_cli.core.plants.system import System, Teacher
 

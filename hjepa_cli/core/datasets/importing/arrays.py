@@ -1,6 +1,6 @@
 """Recordings may be arrays: one for each episode, or parts of a long one."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import accumulate, pairwise
 from typing import Any, Protocol
@@ -77,9 +77,3 @@ def recording(
 def _stream(pictures: Rows, start: int) -> Pictures:
     for at in range(start, pictures.shape[0], BLOCK):
         yield pictures[at : at + BLOCK]
-
-
-def in_blocks(pictures: Iterator[NDArray[Any]]) -> Pictures:
-    """Yield single pictures as blocks of one."""
-    for picture in pictures:
-        yield picture[None]

@@ -13,7 +13,6 @@ from hjepa_cli.errors import DataError, require
 
 SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 LOSSLESS = ("ffv1", "png", "rawvideo", "huffyuv", "ffvhuff")
-UNEVEN = 0.1  # of the usual time between pictures
 
 
 def read(path: Path, chosen: Chosen) -> Recording:

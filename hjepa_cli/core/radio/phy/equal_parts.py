@@ -56,28 +56,6 @@ def equal_devices(
     raise UsageError(f"unknown noise {noise!r}; choose fixed or scaled")
 
 
-def equal_delivery_probability(
-    devices: npt.ArrayLike,
-    payload_bits: npt.ArrayLike,
-    bandwidth_hz: npt.ArrayLike,
-    slot_s: npt.ArrayLike,
-    snr_db: npt.ArrayLike,
-    *,
-    noise: Noise = "fixed",
-) -> Floats:
-    """Return p = exp(−(2^(b N / (W τ_o)) − 1) / γ̄), with N γ̄ in place of γ̄ for scaled noise.
-
-    This is 1 − :func:`~hjepa_cli.core.radio.channel.outage_probability` at R̄ = b/τ_o, W_i = W/N.
-    """
-    n = positive("devices", devices)
-    time_bandwidth = positive("bandwidth", bandwidth_hz) * positive("slot", slot_s)
-    spectral_efficiency = positive("payload", payload_bits) * n / time_bandwidth
-    with np.errstate(over="ignore"):  # a hopeless rate overflows to ∞: never delivered
-        needed_snr = np.expm1(spectral_efficiency * math.log(2.0))
-    mean_snr = snr_ratio(snr_db) * (n if noise == "scaled" else 1.0)
-    return np.asarray(np.exp(-needed_snr / mean_snr))[()]
-
-
 def scaled_noise_devices(packets_per_bit: npt.ArrayLike, weakest: npt.ArrayLike) -> Floats:
     """Return the positive root n of n = k log2(1 + n a), 0 where there is none.
 
