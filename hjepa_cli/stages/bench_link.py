@@ -120,7 +120,7 @@ def run(
         "steps": steps,
         "lockstep": lockstep,
         "period_ms": period_ms,
-        "gap": gap_steps,
+        "gap_steps": gap_steps,
         "delivery": delivery,
         "harm": harm,
         "backend": backend,

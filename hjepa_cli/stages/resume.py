@@ -65,8 +65,15 @@ def given_to(stage: Stage, inputs: dict[str, Any]) -> dict[str, Any]:
     """Return the inputs that a run recorded as the keyword arguments that its stage takes.
 
     What it recorded of a file is where that was; of a flag, the flag.
+
+    Raises:
+        DataError: it was given something that its stage does not take: without it the result would
+            be another one.
     """
     given: dict[str, Any] = {"further": []}
+    for name, value in inputs.items():
+        if value not in (None, False) and name.partition(" ")[0] not in stage.inputs:
+            raise DataError(f"the run was given '{name}', which hjepa {stage.name} does not take")
     for name, value in inputs.items():
         if isinstance(value, bool | int | float | str):
             given[name] = value
