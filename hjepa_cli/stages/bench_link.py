@@ -8,6 +8,7 @@ keep up.
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 import os
@@ -44,6 +45,7 @@ from hjepa_cli.stages.export import checkpoint_of
 from hjepa_cli.stages.plan import Plan, run_directory
 from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint
+from hjepa_cli.storage.files import JSON_LIMIT_BYTES, read_bytes
 from hjepa_cli.storage.runs import Run, describe_input
 from hjepa_cli.wire import protocol
 from hjepa_cli.wire.auth import NO_KEY
@@ -128,7 +130,7 @@ def run(
     inputs = {
         "model": describe_input(model, bundle.digest.hex()),
         "checkpoint": describe_input(path, load_checkpoint(path).digest),
-        **({"trace": describe_input(trace, "")} if trace else {}),
+        **({"trace": describe_input(trace, digest_of(trace))} if trace else {}),
     }
     with Run.create("bench-link", out, settings.as_dict(), {**inputs, **flags}) as record:
         if record.result is not None:
@@ -334,6 +336,11 @@ def simulated(
     controller = StrideController(planner, draws.devices, action_shape=plant.action_shape)
     outcome = simulate(plant, draws, sent[None], controller, sense, tick=tick, watch=watch)
     return outcome.score[0]
+
+
+def digest_of(trace: Path) -> str:
+    """Return the sha256 of a trace's file."""
+    return hashlib.sha256(read_bytes(trace, limit=JSON_LIMIT_BYTES)).hexdigest()
 
 
 def latest_steps(link: LinkDraws) -> int:
