@@ -311,6 +311,8 @@ COMMANDS = (
     ),
     staged(
         "bench-link",
+        further="Datagrams are delayed (--delay-steps, --jitter-steps, --trace) with --lockstep "
+        "only; in real time hjepa link does that.",
         takes=(
             *("model", "devices:bench", "steps:bench", "lockstep", "period_ms", "gap_steps:wire"),
             *("delivery:bench", *LINK, "trace", "harm", "checkpoint:bench", "backend", "out"),

@@ -506,7 +506,7 @@ _WIRE = {
     "trace": Input(
         Path,
         "--trace",
-        "Delays and losses of a recorded link, for both; a line per datagram: MS or lost.",
+        "Losses of a recorded link, and delays, for both; a line per datagram: MS or lost.",
         "FILE",
     ),
     "checkpoint:bench": _model(
