@@ -55,8 +55,11 @@ def plan(directory: Path) -> Plan:
     """Plan the command that is repeated, which skips what is there already; raises as it."""
     if any((directory / name).exists() for name in (MANIFEST, RESULT)):
         return Plan(f"resume {directory}", [f"{directory}, which is finished"], [], [], 0, 0.0)
-    stage, settings, inputs = recall(directory, Screen(quiet=True))
-    whole = stage.plan(settings=settings, out=directory, **given_to(stage, inputs))
+    if (directory / LOG).exists() and import_data.is_import(directory):
+        whole = import_data.plan_resume(directory)
+    else:
+        stage, settings, inputs = recall(directory, Screen(quiet=True))
+        whole = stage.plan(settings=settings, out=directory, **given_to(stage, inputs))
     work = ["go on where it was interrupted; from the start it would", *whole.work]
     return dataclasses.replace(whole, command=f"resume {directory}", work=work)
 
