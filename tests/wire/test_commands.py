@@ -14,6 +14,7 @@ from command_line import ENVIRONMENT, assert_one_line_error, open_shell
 from hjepa_cli.wire.server import open_socket
 
 pytest.importorskip("onnxruntime")
+MODEL = "desktop-h4m2l1"
 HJEPA = [sys.executable, "-m", "hjepa_cli"]
 
 
@@ -38,6 +39,11 @@ def refused(shell, code, *arguments, says=()):
         (["export"], 2, ["--to DIR", "--check DIR"]),
         (["export", "--to", "new"], 2, ["which model?", "hjepa models list"]),
         (["export", "nothing", "--to", "new"], 66, ["nothing"]),
+        (["export", MODEL, "--to", "new", "--check", "m"], 2, ["--to DIR", "--check DIR"]),
+        (
+            ["export", MODEL, "--to", "new", "--method", "hold", "--quiet"],
+            *(2, ["cannot be exported as 'hold'"]),
+        ),
         (["export", "--check", "nowhere"], 66, ["no exported model", "hjepa export MODEL"]),
         (["serve"], 2, ["--model"]),
         (["serve", "--model", "nowhere"], 66, ["no exported model"]),
@@ -58,6 +64,8 @@ def refused(shell, code, *arguments, says=()):
 )
 def test_mistakes(shell, arguments, code, says):
     refused(shell, code, *arguments, says=says)
+    if arguments[0] == "export":
+        refused(shell, code, *arguments, "--dry-run", says=says)
 
 
 def test_a_readable_key_is_refused(shell, tmp_path):
