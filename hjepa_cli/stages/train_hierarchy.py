@@ -146,7 +146,7 @@ def plan_on(
     if settings.augment.strength and (source is None or is_soft(source)):
         work.append(f"harden the encoder for {settings.augment.steps} steps on worse pictures")
         batch = settings.encoder.batch_trajectories * settings.encoder.batch_frames
-        amounts["encoder training frames"] = settings.augment.steps * batch
+        amounts["encoder hardening frames"] = settings.augment.steps * batch
     return plan_training(
         "train-hierarchy",
         settings,
