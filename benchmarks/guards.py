@@ -227,6 +227,9 @@ GUARDS: dict[str, tuple[Change, ...]] = {
     "test_evaluate.py::test_an_interrupt_ends_the_workers_at_once": (
         (EXECUTORS, "                process.kill()\n            raise\n        finally:", "                pass\n            raise\n        finally:"),
     ),
+    "test_survival.py::test_an_interruption_loses_no_curve_that_was_measured": (
+        ("stages/survive.py", "for job in jobs if _key(*job) not in kept]", "for job in jobs]"),
+    ),
     "test_evaluate.py::test_workers_end_with_a_killed_parent": (
         (EXECUTORS, "    threading.Thread(target=end, daemon=True).start()", "    end"),
     ),
@@ -322,6 +325,9 @@ GUARDS: dict[str, tuple[Change, ...]] = {
     ),
     "test_seals.py::test_settings_that_were_changed_are_named": (
         (RUNS, 'if recorded["schema"] == SCHEMA and (changed := differences(recorded["settings"], found)):', "if changed := []:"),
+    ),
+    "test_runs.py::test_a_run_with_other_flags_is_not_the_one_that_is_asked_for": (
+        (RUNS, "return files_of | flags", "return files_of"),
     ),
     "test_resume.py::test_a_state_goes_on_under_its_own_settings_only": (
         (PROGRESS, "if changed := differences(before, settings):", "if changed := []:"),

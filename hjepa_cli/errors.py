@@ -7,8 +7,10 @@ optional hint (the command to run next); it never shows a traceback. Codes follo
 import difflib
 import os
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
+
+MOST_NAMED = 20  # files in one message
 
 
 class HjepaError(Exception):
@@ -91,6 +93,16 @@ def require(module: str, what: str, extra: str, instead: str = "") -> None:
         raise MissingInputError(
             f"{what}, which is not installed", hint=f'pip install "hjepa[{extra}]"{instead}'
         )
+
+
+def together(errors: Sequence[HjepaError]) -> HjepaError:
+    """Return the first of some errors about files; where there are more, it names them all."""
+    first = errors[0]
+    if len(errors) > 1:
+        named = [one.message for one in errors[:MOST_NAMED]]
+        named += [f"{len(errors) - MOST_NAMED} more"] * (len(errors) > MOST_NAMED)
+        first.message = f"{len(errors)} files are damaged or unreadable: {'; '.join(named)}"
+    return first
 
 
 class Unavailable(HjepaError):

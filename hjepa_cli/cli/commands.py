@@ -102,8 +102,8 @@ def _one_link(given: Given) -> None:
     gap, delivery = given["gap_steps"], given["delivery"]
     if gap is not None and delivery is not None:
         raise UsageError(
-            "--gap is a link without fading, --delivery is of one with; give one of them",
-            hint=f"hjepa view --gap {gap:g}, or hjepa view --delivery {delivery:g}",
+            "--gap-steps is a link without fading, --delivery is of one with; give one of them",
+            hint=f"hjepa view --gap-steps {gap:g}, or hjepa view --delivery {delivery:g}",
         )
     given |= {"protocol": "paper", "delivery": 0.05 if delivery is None else delivery}
 
@@ -131,12 +131,12 @@ def _add_sources(settings: Settings, given: Given) -> None:
 
 def _one_rule(settings: Settings, given: Given) -> None:
     if given["innovation"] is not None and given["gap_steps"] != INPUTS["gap_steps:wire"].default:
-        raise UsageError("--gap and --innovation are two rules to send by; give one of them")
+        raise UsageError("--gap-steps and --innovation are two rules to send by; give one of them")
 
 
 def _one_schedule(settings: Settings, given: Given) -> None:
     if given["delivery"] is not None and given["gap_steps"] != INPUTS["gap_steps:wire"].default:
-        raise UsageError("--gap and --delivery are two kinds of uplink; give one of them")
+        raise UsageError("--gap-steps and --delivery are two kinds of uplink; give one of them")
     if given["lockstep"] and given["period_ms"]:
         raise UsageError("--lockstep counts time in the plant's steps: leave --period-ms out")
 
@@ -311,6 +311,8 @@ COMMANDS = (
     ),
     staged(
         "bench-link",
+        further="Datagrams are delayed (--delay-steps, --jitter-steps, --trace) with --lockstep "
+        "only; in real time hjepa link does that.",
         takes=(
             *("model", "devices:bench", "steps:bench", "lockstep", "period_ms", "gap_steps:wire"),
             *("delivery:bench", *LINK, "trace", "harm", "checkpoint:bench", "backend", "out"),

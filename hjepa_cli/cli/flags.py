@@ -384,7 +384,7 @@ _RADIO = {
     ),
     "gap_steps": Input(
         Annotated[float, Meta(ge=1, le=LARGEST)],
-        "--gap",
+        "--gap-steps",
         "Instead of fading: a packet every so many steps.",
         "STEPS",
     ),
@@ -460,12 +460,13 @@ _WIRE = {
         "MS",
     ),
     "gap_steps:wire": Input(
-        Count, "--gap", "Send an embedding every so many control steps.", "STEPS", default=80
+        Count, "--gap-steps", "Send an embedding every so many control steps.", "STEPS", default=80
     ),
     "innovation": Input(
         Annotated[float, Meta(gt=0, le=1)],
         "--innovation",
-        "Instead of --gap: send when the controller's force is wrong by this share of its range.",
+        "Instead of --gap-steps: send when the controller's force is wrong by this share of its "
+        "range.",
         "SHARE",
     ),
     "longest_steps": Input(
@@ -499,13 +500,13 @@ _WIRE = {
     "delivery:bench": Input(
         Annotated[float, Meta(gt=0, le=1)],
         "--delivery",
-        "Instead of --gap: share of packets that arrive, one being sent in every step.",
+        "Instead of --gap-steps: share of packets that arrive, one being sent in every step.",
         "P",
     ),
     "trace": Input(
         Path,
         "--trace",
-        "Delays and losses of a recorded link, for both; a line per datagram: MS or lost.",
+        "Losses of a recorded link, and delays, for both; a line per datagram: MS or lost.",
         "FILE",
     ),
     "checkpoint:bench": _model(

@@ -64,7 +64,7 @@ def exit_code(error: BaseException) -> int:
 
 
 class Postponed:
-    """It handles both signals while it is entered; see :meth:`postpone`."""
+    """It handles all three signals while it is entered; see :meth:`postpone`."""
 
     def __init__(self) -> None:
         self._inside = False

@@ -8,6 +8,7 @@ keep up.
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 import os
@@ -36,7 +37,7 @@ from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_back, frames_of
 from hjepa_cli.core.plants.named import plant_of, seen_as_trained
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.core.statistics import bootstrap_weights, mean_interval
-from hjepa_cli.errors import NumericalError, Unavailable
+from hjepa_cli.errors import NumericalError, Unavailable, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import results
 from hjepa_cli.stages.device import check_plant
@@ -44,6 +45,7 @@ from hjepa_cli.stages.export import checkpoint_of
 from hjepa_cli.stages.plan import Plan, run_directory
 from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint
+from hjepa_cli.storage.files import JSON_LIMIT_BYTES, read_bytes
 from hjepa_cli.storage.runs import Run, describe_input
 from hjepa_cli.wire import protocol
 from hjepa_cli.wire.auth import NO_KEY
@@ -97,7 +99,7 @@ def run(
         out: run directory.
         model: exported model.
         devices, steps: how many, all steps scored.
-        lockstep: without deadlines, in one process.
+        lockstep: without deadlines, in one process; only so datagrams can be delayed.
         period_ms: wall time of a step otherwise.
         gap_steps, delivery: a packet every so many steps, or with this probability.
         trace: of a recorded link, up.
@@ -106,21 +108,21 @@ def run(
         backend: of the runtime.
 
     Raises:
+        UsageError: delays in real time.
         NumericalError: more than 0.1 % of steps had no force in time.
         Unavailable: the server does not start.
-        DataError, MissingInputError: no such model, or of another plant.
+        DataError, MissingInputError: no such model or trace, or of another plant.
         OutOfMemory: what is measured of so many devices and steps does not fit.
     """
-    bundle, kind = open_bundle(model), plant_of(settings)
-    check_plant(bundle, settings)
+    kind = plant_of(settings)
+    bundle, path, recorded = opened(settings, model, checkpoint, trace, lockstep=lockstep)
     memory.check(memory_bytes(kind, bundle, devices, steps), f"{devices} devices, {steps} steps")
-    path = zoo.resolve_model(checkpoint) if checkpoint else checkpoint_of(bundle)
     flags = {
         "devices": devices,
         "steps": steps,
         "lockstep": lockstep,
         "period_ms": period_ms,
-        "gap": gap_steps,
+        "gap_steps": gap_steps,
         "delivery": delivery,
         "harm": harm,
         "backend": backend,
@@ -128,7 +130,7 @@ def run(
     inputs = {
         "model": describe_input(model, bundle.digest.hex()),
         "checkpoint": describe_input(path, load_checkpoint(path).digest),
-        **({"trace": describe_input(trace, "")} if trace else {}),
+        **({"trace": describe_input(trace, digest_of(trace))} if trace else {}),
     }
     with Run.create("bench-link", out, settings.as_dict(), {**inputs, **flags}) as record:
         if record.result is not None:
@@ -139,15 +141,15 @@ def run(
         torch.set_num_threads(1)
         protocol_ = dataclasses.replace(settings.protocol, warmup_steps=0, steps=steps)
         draws = Draws.make(protocol_, devices, settings.seed)
-        period_s = kind.step_s if lockstep else (period_ms or PERIOD_MS) / 1e3
+        period_s = kind.step_s if lockstep else wall_s(period_ms)
         sent = (
             gap_schedule(gap_steps, steps, devices)
             if delivery is None
             else delivery_schedule(delivery, draws.delivery)
         )
         link = draws.link
-        if trace is not None:
-            link, lost = Trace.read(trace).draws(steps, devices, 1e3 * kind.step_s)
+        if recorded is not None:
+            link, lost = recorded.draws(steps, devices, 1e3 * kind.step_s)
             link = dataclasses.replace(link, lost=draws.link.lost)
             sent &= ~lost
             draws = dataclasses.replace(draws, link=link)
@@ -223,17 +225,47 @@ def plan(
     backend: str = "onnxruntime",
 ) -> Plan:
     """Plan a drive; arguments as of :func:`run`."""
-    bundle = open_bundle(model)
-    check_plant(bundle, settings)
+    bundle, *_ = opened(settings, model, checkpoint, trace, lockstep=lockstep)
     return Plan(
         command="bench-link",
         reads=[f"exported model {model}"],
         work=[f"drive {devices} devices for {steps} steps over the wire, and in the simulator"],
         writes=[run_directory("bench-link", out)],
         writes_bytes=20_000,
-        seconds=10 + steps * PERIOD_MS / 1e3 + devices * steps / 20_000,
+        seconds=10 + (0 if lockstep else steps * wall_s(period_ms)) + devices * steps / 20_000,
         memory_bytes=memory_bytes(plant_of(settings), bundle, devices, steps),
     )
+
+
+def wall_s(period_ms: float | None) -> float:
+    """Return what a step in real time takes."""
+    return (period_ms or PERIOD_MS) / 1e3
+
+
+def opened(
+    settings: Settings, model: Path, checkpoint: str | None, trace: Path | None, *, lockstep: bool
+) -> tuple[Bundle, Path, Trace | None]:
+    """Open the exported model, find what it was exported from, and read a trace; as :func:`run`."""
+    bundle = open_bundle(model)
+    check_plant(bundle, settings)
+    path = zoo.resolve_model(checkpoint) if checkpoint else checkpoint_of(bundle)
+    recorded = None if trace is None else Trace.read(trace)
+    protocol_ = settings.protocol
+    late = {
+        "--delay-steps": protocol_.delay_steps,
+        "--jitter-steps": protocol_.jitter_steps,
+        "--trace": recorded and recorded.latest_steps(1e3 * plant_of(settings).step_s),
+    }
+    delays = [flag for flag, steps in late.items() if steps]
+    if recorded and {*delays} - {"--trace"}:
+        raise UsageError(f"--trace has delays of its own: leave {delays[0]} out")
+    if delays and not lockstep:  # they would be in the simulation and not on the wire
+        raise UsageError(
+            f"{delays[0]} delays datagrams, which bench-link does in lockstep only; in real time "
+            "they take what they take",
+            hint="add --lockstep; in real time hjepa link --uplink-delay-ms 5",
+        )
+    return bundle, path, recorded
 
 
 def memory_bytes(kind: System, bundle: Bundle, devices: int, steps: int) -> float:
@@ -334,6 +366,11 @@ def simulated(
     controller = StrideController(planner, draws.devices, action_shape=plant.action_shape)
     outcome = simulate(plant, draws, sent[None], controller, sense, tick=tick, watch=watch)
     return outcome.score[0]
+
+
+def digest_of(trace: Path) -> str:
+    """Return the sha256 of a trace's file."""
+    return hashlib.sha256(read_bytes(trace, limit=JSON_LIMIT_BYTES)).hexdigest()
 
 
 def latest_steps(link: LinkDraws) -> int:

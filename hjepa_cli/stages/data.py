@@ -22,7 +22,7 @@ from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.named import camera_in, camera_of, sensor_in
 from hjepa_cli.core.plants.recorded import Recorded
 from hjepa_cli.core.plants.system import Camera, System
-from hjepa_cli.errors import HjepaError, MissingInputError, UsageError, require
+from hjepa_cli.errors import HjepaError, MissingInputError, UsageError, require, together
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan, seconds_of, size
 from hjepa_cli.storage import files
@@ -31,7 +31,6 @@ Result = dict[str, Any]
 
 ROOT = Path("data")
 FORMATS = {"hdf5": (".h5", ".hdf5"), "npz": (".npz",)}  # the first suffix is written by default
-MOST_NAMED = 20  # damaged files in one message
 COMPRESSED_FRAME_BYTES = 700
 
 
@@ -93,12 +92,7 @@ def verify(screen: Screen, paths: Sequence[Path]) -> Result:
             ],
         )
     if damaged:
-        first = damaged[0]
-        if len(damaged) > 1:
-            named = [one.message for one in damaged[:MOST_NAMED]]
-            named += [f"{len(damaged) - MOST_NAMED} more"] * (len(damaged) > MOST_NAMED)
-            first.message = f"{len(damaged)} files are damaged or unreadable: {'; '.join(named)}"
-        raise first
+        raise together(damaged)
     return {"verified": verified}
 
 

@@ -38,19 +38,11 @@ def run(
         UsageError: neither or both of ``to`` and ``check``, or no such method.
         NumericalError: what was exported computes something else.
     """
-    if (to is None) == (check is None):
-        raise UsageError(
-            "give --to DIR to export a model, or --check DIR to check one that is exported",
-            hint="hjepa export desktop-h4m2l1 --to exported",
-        )
+    path = source(name_or_path, to, check)
     if check is not None:
         bundle = open_bundle(check)
-        path = zoo.resolve_model(name_or_path) if name_or_path else checkpoint_of(bundle)
     else:
-        if name_or_path is None:
-            raise UsageError("which model? name one of the zoo or a path", hint="hjepa models list")
         assert to is not None
-        path = zoo.resolve_model(name_or_path)
         screen.say(f"exporting {path}, which takes a minute or two")
         bundle = exports.export(path, to, method)
     measured = exports.check(bundle, path, backend)
@@ -71,18 +63,39 @@ def run(
 
 
 def plan(
-    *, name_or_path: str | None = None, to: Path | None = None, check: Path | None = None
+    *,
+    name_or_path: str | None = None,
+    to: Path | None = None,
+    check: Path | None = None,
+    method: str | None = None,
 ) -> Plan:
     """Plan an export or a check; arguments and errors as of :func:`run`."""
+    path = source(name_or_path, to, check)
     if check is not None:
-        open_bundle(check)
         work = [f"compare it with torch on {exports.CHECKED} pictures"]
-        return Plan("export", [str(check)], work, [f"{check}/{CHECK}"], 1000, 15.0)
-    if to is None or name_or_path is None:
-        run(Screen(quiet=True), name_or_path=name_or_path, to=to)
-    path = zoo.resolve_model(name_or_path or "")
+        return Plan("export", [str(check), str(path)], work, [f"{check}/{CHECK}"], 1000, 15.0)
+    assert to is not None
+    exports.exportable(path, to, method)
     work = ["write its networks as ONNX", f"compare them on {exports.CHECKED} pictures"]
     return Plan("export", [str(path)], work, [f"{to}/{MANIFEST}, networks"], 15_000_000, 60.0)
+
+
+def source(name_or_path: str | None, to: Path | None, check: Path | None) -> Path:
+    """Return the checkpoint to export, or to check an exported model against.
+
+    Raises:
+        UsageError: neither or both of ``to`` and ``check``, or nothing to export.
+    """
+    if (to is None) == (check is None):
+        raise UsageError(
+            "give --to DIR to export a model, or --check DIR to check one that is exported",
+            hint="hjepa export desktop-h4m2l1 --to exported",
+        )
+    if name_or_path is not None:
+        return zoo.resolve_model(name_or_path)
+    if check is None:
+        raise UsageError("which model? name one of the zoo or a path", hint="hjepa models list")
+    return checkpoint_of(open_bundle(check))
 
 
 def checkpoint_of(bundle: Bundle) -> Path:

@@ -7,6 +7,8 @@ shards are kept, so that an import that was interrupted goes on.
 
 import contextlib
 import dataclasses
+import hashlib
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +22,7 @@ from hjepa_cli.core.datasets.dataset import (
     Dataset,
     definition_of,
     open_directory,
+    undone,
     write_recording,
     write_shards,
 )
@@ -35,7 +38,7 @@ from hjepa_cli.stages.collect import telling_how_to_go_on
 from hjepa_cli.stages.plan import Plan
 from hjepa_cli.storage import files
 from hjepa_cli.storage.runs import continue_command
-from hjepa_cli.storage.shards import LOG, NAME, ShardLog, read_task, remove_log
+from hjepa_cli.storage.shards import LOG, ShardLog, read_task, remove_log
 
 TASK = "import"  # in the first line of the log of an unfinished import
 IMPORTED_FRAMES_PER_S = 3000.0
@@ -111,11 +114,11 @@ def import_recordings(
     definition = definition_of(prepared, task.options.camera)
     existed = out is not None and out.exists()
     with open_directory(out, RECORDED) as directory:
-        begun = {TASK: to_plain(task), "sources": stamps(task)}
+        begun = begun_with(task)
         if (directory / LOG).exists():
             check_same(directory, begun)
         files.check_free_space(directory, size_bytes(prepared))
-        with telling_how_to_go_on(directory), undone(directory, keep=existed):
+        with telling_how_to_go_on(directory), undone(directory, DataError, keep=existed):
             data = write(directory, prepared, definition, ShardLog(directory, begun), screen)
     result = describe(data, prepared, verdict, time.perf_counter() - started)
     if prepared.lossy:
@@ -156,20 +159,6 @@ def write(
     data = write_recording(directory, [log.done[shard.name] for shard in shards], definition)
     remove_log(directory)
     return data
-
-
-@contextlib.contextmanager
-def undone(directory: Path, *, keep: bool) -> Iterator[None]:
-    """Leave nothing of an import whose source turns out to be unsound."""
-    try:
-        yield
-    except DataError:
-        for path in directory.iterdir():
-            if NAME.fullmatch(path.name) or path.name in (LOG, files.LOCK_FILE):
-                path.unlink()
-        if not keep:
-            directory.rmdir()
-        raise
 
 
 def task_of(
@@ -238,6 +227,13 @@ def resume(directory: Path, screen: Screen) -> Result:
     return import_task(screen, recorded_task(directory), directory)
 
 
+def plan_resume(directory: Path) -> Plan:
+    """Plan to take up the unfinished import in a directory; it refuses what :func:`resume` does."""
+    task = recorded_task(directory)
+    check_same(directory, begun_with(task))
+    return plan_task(task, directory)
+
+
 def is_import(directory: Path) -> bool:
     """Tell whether an unfinished dataset is imported, not collected."""
     return TASK in read_task(directory)
@@ -254,10 +250,26 @@ def recorded_task(directory: Path) -> Task:
         ) from None
 
 
-def stamps(task: Task) -> dict[str, list[int]]:
-    """Return size and time of each source, which change with it."""
-    found = {split: Path(path).stat() for split, path in task.sources.items()}
-    return {split: [one.st_size, one.st_mtime_ns] for split, one in found.items()}
+def begun_with(task: Task) -> dict[str, Any]:
+    """Return the first line of the log of an import."""
+    return {TASK: to_plain(task), "sources": stamps(task)}
+
+
+def stamps(task: Task) -> dict[str, Any]:
+    """Return size and time of each source, or what follows from those of all files in it.
+
+    A folder's own do not change where a picture in it is replaced.
+    """
+    return {split: _stamp(Path(path)) for split, path in task.sources.items()}
+
+
+def _stamp(source: Path) -> list[int] | str:
+    if not source.is_dir():
+        found = source.stat()
+        return [found.st_size, found.st_mtime_ns]
+    inside = sorted(path for path in source.rglob("*") if path.is_file())
+    each = [[os.fspath(path.relative_to(source)), *_stamp(path)] for path in inside]
+    return hashlib.sha256(repr(each).encode()).hexdigest()
 
 
 def check_same(directory: Path, begun: Mapping[str, Any]) -> None:

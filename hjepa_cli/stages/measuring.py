@@ -1,7 +1,7 @@
 """``eval`` and ``scale`` take curves of closed loops from a cache, or measure them now."""
 
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from hjepa_cli.config.checks import needs_model, split_late
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control import link
-from hjepa_cli.core.control.loop import LOOP_VERSION, check_memory
+from hjepa_cli.core.control.loop import LOOP_VERSION, Outcome, check_memory
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.bench import Bench
@@ -178,35 +178,33 @@ def cached(models: ModelSet, methods: Sequence[str]) -> dict[str, tuple[Entry, P
 
 
 def measure_points(
-    models: ModelSet,
-    screen: Screen,
-    *,
-    method: str,
-    gaps: Sequence[float] = (),
-    probabilities: Sequence[float] = (),
-) -> list[dict[str, Any]]:
-    """Drive all bracket devices at given gaps (steps) or delivery probabilities, now.
+    models: ModelSet, screen: Screen, asked: Mapping[str, Sequence[Point]]
+) -> dict[str, list[dict[str, Any]]]:
+    """Drive all bracket devices at the points that are asked for of each method, now.
 
-    Returns an entry per gap, then per probability, as in the curves of ``eval --json``. Raises
-    UsageError if the method cannot be measured.
+    Returns an entry per point, as in the curves of ``eval --json``, by method. Raises UsageError if
+    one cannot be measured.
     """
     settings, protocol = models.settings, models.settings.protocol
-    if split_late(method)[0] not in models.methods:
-        raise UsageError(
-            f"no model for method '{method}'; {choices(method, models.methods)}",
-            hint=how_to_train(method, settings),
-        )
-    points = [Point("gap", gap) for gap in gaps]
-    points += [Point("delivery", 1 / p) for p in probabilities]
+    for method in asked:
+        if split_late(method)[0] not in models.methods:
+            raise UsageError(
+                f"no model for method '{method}'; {choices(method, models.methods)}",
+                hint=how_to_train(method, settings),
+            )
     device_steps = _device_steps(protocol)
-    with (
-        open_workers(device_steps) as workers,
-        ticking(screen, f"verify {method}", (len(points) + 1) * device_steps) as tick,
-    ):
-        runner = workers.runner(settings, models.of(method).file)
-        bench = Bench(protocol, settings.seed, runner, tick)
-        outcome = bench.measure(method, points, protocol.bracket_devices)
-    return bench.reference.describe(points, outcome)
+    total = (sum(map(len, asked.values())) + 1) * device_steps
+    label = f"verify {next(iter(asked), '')}" if len(asked) < 2 else f"verify {len(asked)} methods"
+    with open_workers(device_steps) as workers, ticking(screen, label, total) as tick:
+        bench = Bench(protocol, settings.seed, workers.runner(settings, models.file), tick)
+
+        def driven(method: str) -> Outcome:
+            runner = workers.runner(settings, models.of(method).file)
+            return bench.sharing(runner).measure(method, asked[method], protocol.bracket_devices)
+
+        with closing(workers.each(driven, asked)) as ready:
+            outcomes = dict(ready)
+    return {name: bench.reference.describe(asked[name], outcomes[name]) for name in asked}
 
 
 _Job = tuple[str, _Share]

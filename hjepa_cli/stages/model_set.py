@@ -123,7 +123,7 @@ class ModelSet:
         digest = self.model.digest if self.model else None
         return Digest.of(digest, self.settings, self.dataset.settings if self.dataset else None)
 
-    def inputs(self, **flags: bool) -> dict[str, Any]:
+    def inputs(self, **flags: bool | float | None) -> dict[str, Any]:
         """Return what a run of these models was given, for :meth:`Run.create`."""
         given: dict[str, Any] = dict(flags)
         for number, one in enumerate((self, *self.further), start=1):

@@ -4,7 +4,7 @@ from typing import Any
 
 from hjepa_cli.config.schema import dotted
 from hjepa_cli.config.settings import PRESETS, load_settings
-from hjepa_cli.errors import DataError, HjepaError
+from hjepa_cli.errors import DataError, HjepaError, together
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.storage.zoo import CURVES_FILE, ZooModel, list_models, verify_model
 
@@ -53,15 +53,16 @@ def verify(screen: Screen, names: list[str]) -> Result:
     """Check models against their sha256, all of the zoo if none is named.
 
     Say as well whether the measured curves beside a model are those of the present defaults, which
-    ``eval`` and ``scale`` would otherwise measure again. Raise MissingInputError without a model,
-    and DataError for the first damaged one, after all of them.
+    ``eval`` and ``scale`` would otherwise measure again. Raise, after all of them, the error of
+    the first that is damaged, unreadable or not there, which names the others too.
     """
-    damaged, verified = [], []
+    damaged: list[HjepaError] = []
+    verified: list[Result] = []
     for name in names or list_models():
         try:
             model = verify_model(name)
             missing = missing_curves(model) if model.has_curves else None
-        except DataError as error:
+        except HjepaError as error:
             damaged.append(error)
         else:
             verified.append(_summary(model) | {"missing_curves": missing})
@@ -69,10 +70,8 @@ def verify(screen: Screen, names: list[str]) -> Result:
             if missing:
                 about = f"; default curves to be measured again: {', '.join(missing)}"
             screen.result(f"{name}: intact, sha256 {model.digest}{about}")
-    for further in damaged[1:]:
-        screen.say(further.message)
     if damaged:
-        raise damaged[0]
+        raise together(damaged)
     return {"verified": verified}
 
 

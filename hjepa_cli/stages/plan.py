@@ -15,17 +15,18 @@ from hjepa_cli.output.screen import Screen
 
 T = TypeVar("T")
 
-RATES_PER_S = {  # two cores of a server CPU
+RATES_PER_S = {  # two cores of a server CPU; frames of an encoder are its inputs, of κ pictures
     "simulated steps": 400_000.0,
     "rendered frames": 6_000.0,
-    "encoder training frames": 500.0,
-    "encoded frames": 3_000.0,
-    "level training steps": 10.0,
+    "encoder training frames": 800.0,
+    "encoder hardening frames": 1_200.0,
+    "encoded frames": 7_000.0,
+    "level training steps": 25.0,
     "reflex training samples": 80_000.0,
     "device-steps of searches": 3_000_000.0,
-    "closed-loop frames": 3_500.0,
-    "device-steps on embeddings": 50_000.0,
-    "device-steps on states": 300_000.0,
+    "closed-loop frames": 7_000.0,
+    "device-steps on embeddings": 60_000.0,
+    "device-steps on states": 600_000.0,
     "exported frames": 2_000.0,
 }
 

@@ -6,12 +6,15 @@ stage reads what the one before it left in the folder and nothing else; the same
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli.compute import memory
 from hjepa_cli.config.checks import check_cell, check_gaps, check_schedulable, without_model
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.drivers import offered_methods
+from hjepa_cli.core.control.loop import check_memory
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.radio.capacity import parse_snr
 from hjepa_cli.errors import UsageError
@@ -36,6 +39,8 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     It raises as :func:`check` and the stages; what is finished stays.
     """
     check(settings)
+    planned = parts(settings)
+    memory.check(memory_bytes(planned), "reproduce")
     with Run.create("reproduce", out, settings.as_dict()) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
@@ -47,7 +52,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             how = how_to_train(name, settings)
             screen.say(f"{name} left out, no model of it is trained here: {how}")
         given = inputs_in(folder)
-        expected_s = {part.command: round(part.seconds) for part in parts(settings)}
+        expected_s = {part.command: round(part.seconds) for part in planned}
         results: dict[str, Any] = {}
         with screen.progress("all stages", sum(expected_s.values())) as bar:
             for number, (name, inputs) in enumerate(given.items(), start=1):
@@ -71,7 +76,13 @@ def plan(settings: Settings, *, out: Path | None = None) -> Plan:
         writes=[f"folder {run_directory('reproduce', out)} with a report and its figures"],
         writes_bytes=sum(part.writes_bytes for part in planned),
         seconds=15 + sum(part.seconds for part in planned),
+        memory_bytes=memory_bytes(planned),
     )
+
+
+def memory_bytes(planned: Sequence[Plan]) -> float:
+    """Return what the stage takes that takes most: they come one after the other."""
+    return max(part.memory_bytes for part in planned)
 
 
 def parts(settings: Settings) -> list[Plan]:
@@ -117,6 +128,7 @@ def check(settings: Settings) -> None:
         UsageError: a baseline in place of the encoder, no method of which a model is trained here
             or that has a link to schedule, too few slots for it, trajectories too short for the
             strides or the horizon, a bad SNR grid.
+        OutOfMemory: a closed loop that does not fit.
     """
     method, collected = settings.encoder.method, settings.collect
     if method != "jepa":
@@ -142,6 +154,9 @@ def check(settings: Settings) -> None:
     check_stride(max(settings.encoder.h, settings.hierarchy.h), collected.steps)
     check_horizon(settings.protocol.horizon, collected.clean_steps)
     check_gaps(settings.protocol)
+    check_memory(
+        settings.protocol, max(settings.protocol.curve_devices, settings.protocol.bracket_devices)
+    )
     parse_snr(settings.radio.snr_db)
     check_cell(settings.radio, nr=settings.nr)
 

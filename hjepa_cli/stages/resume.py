@@ -55,8 +55,11 @@ def plan(directory: Path) -> Plan:
     """Plan the command that is repeated, which skips what is there already; raises as it."""
     if any((directory / name).exists() for name in (MANIFEST, RESULT)):
         return Plan(f"resume {directory}", [f"{directory}, which is finished"], [], [], 0, 0.0)
-    stage, settings, inputs = recall(directory, Screen(quiet=True))
-    whole = stage.plan(settings=settings, out=directory, **given_to(stage, inputs))
+    if (directory / LOG).exists() and import_data.is_import(directory):
+        whole = import_data.plan_resume(directory)
+    else:
+        stage, settings, inputs = recall(directory, Screen(quiet=True))
+        whole = stage.plan(settings=settings, out=directory, **given_to(stage, inputs))
     work = ["go on where it was interrupted; from the start it would", *whole.work]
     return dataclasses.replace(whole, command=f"resume {directory}", work=work)
 
@@ -65,8 +68,15 @@ def given_to(stage: Stage, inputs: dict[str, Any]) -> dict[str, Any]:
     """Return the inputs that a run recorded as the keyword arguments that its stage takes.
 
     What it recorded of a file is where that was; of a flag, the flag.
+
+    Raises:
+        DataError: it was given something that its stage does not take: without it the result would
+            be another one.
     """
     given: dict[str, Any] = {"further": []}
+    for name, value in inputs.items():
+        if value not in (None, False) and name.partition(" ")[0] not in stage.inputs:
+            raise DataError(f"the run was given '{name}', which hjepa {stage.name} does not take")
     for name, value in inputs.items():
         if isinstance(value, bool | int | float | str):
             given[name] = value

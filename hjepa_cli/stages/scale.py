@@ -83,9 +83,7 @@ def run(
     grid_db, asked = parse_snr(radio.snr_db), Looks.of(title, labels, log)
     check_cell(radio, {"remeasure": remeasure}, settings.nr)
     count = counting(settings, screen, checkpoint, dataset, further, tolerance_steps)
-    given: dict[str, Any] = {"verify": verify}
-    if tolerance_steps is not None:
-        given["tolerance_steps"] = tolerance_steps
+    given: dict[str, Any] = {"verify": verify, "tolerance_steps": tolerance_steps}
     if "remeasure" in LAWS[radio.law].uses:
         given["remeasure"] = remeasure
     with Run.create("scale", out, settings.as_dict(), count.models.inputs(**given)) as record:

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control import link
 from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
+from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
@@ -72,8 +73,7 @@ class ByFormula:
             for snr_db, at in wanted.items()
             for name in at
         ]
-        driven = requirements.values() if verify else ()
-        checks = [check for one in driven for check in self._verify(one)]
+        checks = self._verify(requirements.values()) if verify else []
         return {
             **{key: measured[key] for key in ("checkpoint", "checkpoints", "source")},
             "n_devices": protocol.bracket_devices,
@@ -156,13 +156,31 @@ class ByFormula:
         holder = self.models.of(method)
         return build_driver(method, holder.settings, holder.model).bits_per_transmission
 
-    def _verify(self, loop: LinkRequirement) -> list[Row]:
-        """Drive a block of loops a little inside and a little outside a tolerance.
+    def _verify(self, loops: Iterable[LinkRequirement]) -> list[Row]:
+        """Drive a block of loops a little inside and a little outside each tolerance."""
+        sides = {late(loop.method, loop.delay_steps): self._sides(loop) for loop in loops}
+        sides = {name: of for name, of in sides.items() if of}
+        if not sides:
+            return []
+        kind, acceptable = self._law.axis.kind, self._settings.protocol.acceptable_score
+        asked = {
+            name: [Point(kind, value if kind == "gap" else 1 / value) for _, value, _ in of]
+            for name, of in sides.items()
+        }
+        driven = measure_points(self.models, self._screen, asked)
+        return [
+            verdict(name, share, point, acceptable, inside=inside)
+            for name, of in sides.items()
+            for (share, _, inside), point in zip(of, driven[name], strict=True)
+        ]
+
+    def _sides(self, loop: LinkRequirement) -> list[tuple[float, float, bool]]:
+        """Return where to drive a loop: share of its tolerance, value, and whether that is inside.
 
         A side is left out where it would be more than a packet in every slot, and the outside where
         the tolerance is only known as a bound.
         """
-        axis, acceptable = self._law.axis, self._settings.protocol.acceptable_score
+        axis = self._law.axis
         if not loop.tolerance or loop.tolerance == 1 or not loop.payload_bits:
             return []
         sides = []
@@ -171,13 +189,7 @@ class ByFormula:
             possible = value >= 1 if axis.larger_is_worse else value <= 1
             if possible and (inside or not loop.at_least):
                 sides.append((share, value, inside))
-        name = late(loop.method, loop.delay_steps)
-        asked: dict[str, Any] = {axis.argument: [value for _, value, _ in sides]}
-        driven = measure_points(self.models, self._screen, method=name, **asked)
-        return [
-            verdict(name, share, point, acceptable, inside=inside)
-            for (share, _, inside), point in zip(sides, driven, strict=True)
-        ]
+        return sides
 
 
 def described(result: Mapping[str, Any]) -> str:

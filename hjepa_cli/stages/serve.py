@@ -77,8 +77,8 @@ def run(
         dashboard = open_doors.enter_context(Dashboard(screen))
 
         def report(found: dict[str, Any]) -> None:
-            latest.clear()
-            latest.update(found)
+            nonlocal latest
+            latest = found  # a scrape, in a thread of its own, has the old one or the new one
             dashboard.show(found)
 
         until_s = float("inf") if for_s is None else time.monotonic() + for_s

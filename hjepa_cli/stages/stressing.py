@@ -5,12 +5,11 @@ gaps between packets, by itself and ÷ the nominal one.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.checks import split_late
 from hjepa_cli.config.schema import RECORDED, Settings
-from hjepa_cli.core.control.loop import LOOP_VERSION, Outcome, check_memory
+from hjepa_cli.core.control.loop import Outcome, check_memory
 from hjepa_cli.core.evaluation import robustness
 from hjepa_cli.core.evaluation.bench import Bench
 from hjepa_cli.core.evaluation.protocol import Point
@@ -20,16 +19,16 @@ from hjepa_cli.core.plants import stress
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.plants.stress import Condition
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen, ticking
 from hjepa_cli.plugins import METHODS
+from hjepa_cli.stages.kept import Kept
 from hjepa_cli.stages.measuring import seconds_of_loops
 from hjepa_cli.stages.model_set import ModelSet
-from hjepa_cli.storage import files, seals
 from hjepa_cli.storage.runs import Run
 
 NOMINAL = ""
-FILE, SCHEMA = "stress.json", 1
+FILE = "stress.json"
 
 
 def plan_stress(models: ModelSet) -> tuple[list[str], float]:
@@ -77,8 +76,7 @@ def measure_stress(models: ModelSet, screen: Screen, record: Run) -> dict[str, A
     models.say_skipped(settings.methods, screen)
     methods, rows = models.measurable(settings.methods), rows_of(settings)
     gaps = robustness.gaps_of(plant_of(settings))
-    path = record.path(FILE)
-    kept = _read(path)
+    kept = Kept(record.path(FILE))
     jobs = [(method, text) for text in (NOMINAL, *rows) for method in methods]
     missing = [job for job in jobs if _key(*job) not in kept]
     device_steps = protocol.curve_devices * protocol.total_steps
@@ -98,9 +96,7 @@ def measure_stress(models: ModelSet, screen: Screen, record: Run) -> dict[str, A
                 runner = workers.runner(rows.get(text, settings), models.of(method).file)
                 points, devices = points_of(method, gaps), protocol.curve_devices
                 started[next_one] = start_points(runner, method, points, devices, tick)
-            kept[_key(*job)] = robustness.kept(started.pop(job)())
-            document = {"schema": SCHEMA, "loop_version": LOOP_VERSION, "rows": kept}
-            files.write_json(path, seals.sealed(document))
+            kept.add(_key(*job), robustness.kept(started.pop(job)()))
     outcomes = {job: robustness.taken(kept[_key(*job)]) for job in jobs}
     return {
         "gaps": list(gaps),
@@ -145,16 +141,3 @@ def _entry(
 
 def _key(method: str, text: str) -> str:
     return f"{method} under {text or 'nominal conditions'}"
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """Return the rows of an interrupted run; none of one of another version."""
-    if not path.exists():
-        return {}
-    document = seals.read(path, SCHEMA, f"delete {path} to measure them again")
-    if document.get("loop_version") != LOOP_VERSION:
-        return {}
-    rows = document.get("rows")
-    if not isinstance(rows, dict):
-        raise DataError(f"{path} holds no rows", hint=f"delete {path} to measure them again")
-    return dict(rows)

@@ -34,6 +34,7 @@ from hjepa_cli.output.screen import Screen, can_draw, span, ticking
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import results
 from hjepa_cli.stages.inputs import refuse_recorded
+from hjepa_cli.stages.kept import Kept
 from hjepa_cli.stages.measuring import cached, seconds_of_loops
 from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory
@@ -41,6 +42,7 @@ from hjepa_cli.storage.runs import Run
 
 Row = dict[str, Any]
 
+FILE = "survival.json"
 CELL_SNR_DB = 20.0  # where devices are counted, if the settings have it
 LONGER = 1.5  # a gap than the one before, beyond the protocol's
 MOST_LONGER = 3
@@ -66,14 +68,14 @@ def run(
         screen: shows the result.
         checkpoint: zoo name, run directory or file; default: the newest run that fits, else the
             zoo.
-        out: run directory; of an interrupted run it goes on after the last measured method.
+        out: run directory; of an interrupted one what is measured is not measured again.
         further: models of methods that the first one does not hold; ``None`` looks for them.
 
     Raises:
         UsageError: no method with a link, an interval as long as the watched time, or a cell that
             there is not.
         MissingInputError: no such checkpoint, or none with any of the methods.
-        DataError: a damaged checkpoint, or one of another plant.
+        DataError: a damaged checkpoint or file of the run, or a checkpoint of another plant.
     """
     models, methods = opened(settings, screen, checkpoint, further)
     with Run.create("survive", out, settings.as_dict(), models.inputs()) as record:
@@ -159,7 +161,10 @@ def opened(
 def measured(
     models: ModelSet, methods: Sequence[str], screen: Screen, record: Run
 ) -> dict[str, Any]:
-    """Measure all methods at all intervals; return the document of ``--json``."""
+    """Measure all methods at all intervals, keep each; return the document of ``--json``.
+
+    Curves that an interrupted run has measured are taken from its file.
+    """
     settings, options = models.settings, models.settings.survival
     plant = actual_plant(settings.plant, settings.conditions)
     curves = cached(models, methods)
@@ -167,21 +172,22 @@ def measured(
     snr_db = CELL_SNR_DB if CELL_SNR_DB in grid_db else max(grid_db)
     jobs = [(name, interval) for name in methods for interval in options.intervals_steps]
     steps = Trial.of(settings.protocol, 1).steps(settings.protocol.gaps[-1])
-    total = len(jobs) * options.loops * steps * (len(settings.protocol.gaps) + ROUNDS_AS_A_RULE)
-    found: dict[tuple[str, int], Row] = {}
+    kept = Kept(record.path(FILE))
+    missing = [job for job in jobs if _key(*job) not in kept]
+    total = len(missing) * options.loops * steps * (len(settings.protocol.gaps) + ROUNDS_AS_A_RULE)
     with (
         open_workers(options.loops * steps) as workers,
-        ticking(screen, f"{len(jobs)} survival curves", total) as tick,
+        ticking(screen, f"{len(missing)} survival curves", total) as tick,
     ):
         silences = Survivals(models, workers, tick)
-        with closing(workers.each(lambda job: silences.measure(*job), jobs)) as ready:
+        with closing(workers.each(lambda job: silences.measure(*job), missing)) as ready:
             for job, curve in ready:
-                found[job] = curve
+                kept.add(_key(*job), curve)
                 record.event("measured", method=job[0], interval_steps=job[1])
     rows = []
     cell = Cell.of(settings, plant)
     for name, interval in jobs:
-        curve = found[name, interval]
+        curve = kept[_key(name, interval)]
         bits = curve["bits_per_transmission"]
         carried = cell.link(bits, snr_db).carried
         shared = {
@@ -224,8 +230,12 @@ def measured(
         "mean_time_h": options.mean_time_h,
         "skipped": models.skipped(settings.methods),
         "rows": rows,
-        "curves": [found[job] for job in jobs],
+        "curves": [kept[_key(*job)] for job in jobs],
     }
+
+
+def _key(method: str, interval: int) -> str:
+    return f"{method} at intervals of {interval} steps"
 
 
 class Survivals:

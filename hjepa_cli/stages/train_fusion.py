@@ -6,6 +6,7 @@ that was predicted for a moment and the packet of that moment it tells where the
 
 import copy
 import functools
+import math
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.planners import corrected
 from hjepa_cli.core.networks.model import Model, load_modules
 from hjepa_cli.core.plants.conditions import altered
-from hjepa_cli.core.training.fusion_loops import Heard, listen
+from hjepa_cli.core.training.fusion_loops import Heard, ends_of_gaps, listen
 from hjepa_cli.core.training.losses import cosine_loss
 from hjepa_cli.core.training.optimiser import Optimiser, name_samples
 from hjepa_cli.errors import UsageError
@@ -82,6 +83,7 @@ def plan(
     find = functools.partial(open_hierarchy, checkpoint, settings, Screen(quiet=True))
     model, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     loops = 2 * options.rounds * options.devices * options.loop_steps
+    shortest, longest = ends_of_gaps(settings.protocol.gaps)
     architecture = dict(model.metadata["architecture"]) if model else {}
     return plan_training(
         "train-fusion",
@@ -95,7 +97,8 @@ def plan(
         ],
         amounts={
             "device-steps on embeddings": loops,
-            "closed-loop frames": loops / settings.protocol.gaps[1],
+            # Each packet is seen twice, as it comes and in a clean picture.
+            "closed-loop frames": 2 * loops / math.sqrt(shortest * longest),
             "level training steps": options.rounds * options.steps / 10,
         },
     )

@@ -149,7 +149,7 @@ def plan_on(
         work.append(f"harden the encoder for {settings.augment.steps} steps on worse pictures")
         _, recorded_steps = sizes_of(data, settings)["train"]
         batch = frames_of_step(settings, recorded_steps)
-        amounts["encoder training frames"] = settings.augment.steps * batch
+        amounts["encoder hardening frames"] = settings.augment.steps * batch
     return plan_training(
         "train-hierarchy",
         settings,

@@ -12,9 +12,10 @@ import numpy as np
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.plants.control_law import check_stable
+from hjepa_cli.core.plants.control_law import instability
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.law_search import GAPS, LawSearch
+from hjepa_cli.errors import NumericalError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.inputs import refuse_recorded
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
@@ -29,7 +30,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     """Search both laws and write them; return the document of ``--json``.
 
     Raises:
-        NumericalError: the search found no law that holds the plant.
+        NumericalError: the search found no law that holds the plant; both are written all the same.
     """
     refuse_recorded(settings, WHY)
     kind = plant(settings.plant)
@@ -44,7 +45,17 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
         for name in ("gains_n", "ceiling_gains_n"):
             screen.say(f"searching control.{name} of plant {kind.name} on the true state")
             found[name] = np.round(search.gains_n(learnable=name == "gains_n"), 3)
-            check_stable(kind, found[name], f"control.{name}")
+        lines = [f"# hjepa tune-law --plant {kind.name} --seed {settings.seed}"]
+        lines += [f'plant = "{kind.name}"', "", "[control]"]
+        lines += [f"{name} = {gains.ravel().tolist()}" for name, gains in found.items()]
+        write_text(record.path(LAW), "\n".join(lines) + "\n")
+        for name, gains in found.items():
+            if flaw := instability(kind, gains):
+                raise NumericalError(
+                    f"the control.{name} that was found {flaw}; it is in {record.path(LAW)}",
+                    hint=f"more [tune] rounds than {settings.tune.rounds} in --config FILE.toml, "
+                    f"or --seed {settings.seed + 1}",
+                )
         result = {
             "plant": kind.name,
             "seed": settings.seed,
@@ -54,10 +65,6 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
             "law": str(record.path(LAW)),
             "seconds": time.perf_counter() - began,
         }
-        lines = [f"# hjepa tune-law --plant {kind.name} --seed {settings.seed}"]
-        lines += [f'plant = "{kind.name}"', "", "[control]"]
-        lines += [f"{name} = {gains.ravel().tolist()}" for name, gains in found.items()]
-        write_text(record.path(LAW), "\n".join(lines) + "\n")
         result = record.finish(result)
     _show(result, screen)
     screen.say(

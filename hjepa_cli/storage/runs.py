@@ -48,6 +48,7 @@ SMOKE = "smoke"  # the preset that shows that all of it runs, too small to learn
 LAST_EVENTS_BYTES = 4096
 ASKED = ("remeasure", "verify")  # flags that are work, which a finished run has done or has not
 STRENGTH = "augment.strength"  # without any, all else in the section says nothing
+SHOWN = ("figure",)  # flags that say what is made of a result, not which one it is
 
 SCHEMA = 3  # of environment.json; 1 had neither a schema nor inputs, 2 no settings
 RESULT_SCHEMA = 2  # 1 had neither a schema nor a seal
@@ -86,7 +87,8 @@ class Run:
                 :func:`describe_input`, flags as they are.
 
         Raises:
-            UsageError: ``out`` holds something else, or a run with other settings or input files.
+            UsageError: ``out`` holds something else, or a run with other settings, flags or input
+                files.
             LockedError: another process works in it.
             StorageError: not writable.
             MissingInputError: ``HJEPA_LOG`` asks for a package that is not installed.
@@ -197,7 +199,9 @@ class Run:
                 kept = read_config(self.directory) | {"preset": self.preset}
             changed = differences(kept, settings)
             if recorded["schema"] > 1:
-                changed += differences(*map(_digests, (recorded["inputs"], inputs)))
+                begun_with = recorded["inputs"]
+                given = _compared(begun_with, inputs), _compared(inputs, begun_with)
+                changed += differences(*given)
             if changed:
                 raise UsageError(
                     f"{self.directory} holds {'a finished' if finished else 'an unfinished'} run "
@@ -525,10 +529,17 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _digests(inputs: Mapping[str, Any]) -> dict[str, Any]:
-    return {
+def _compared(inputs: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Return of some inputs what a result follows from: sha256 of files, and flags as they are.
+
+    A flag that the ``others`` say nothing of is of another version.
+    """
+    files_of = {
         name: value.get("sha256") for name, value in inputs.items() if isinstance(value, Mapping)
     }
+    both = (inputs.keys() & others.keys()) - files_of.keys() - {*ASKED, *SHOWN}
+    flags = {name: inputs[name] for name in both if not isinstance(others[name], Mapping)}
+    return files_of | flags
 
 
 def _toml(value: Any) -> str:

@@ -206,22 +206,30 @@ def check_pictures(model: Model, path: Path) -> None:
         raise UsageError(f"{path} sees pictures of {sizes[0]}; devices take those of {sizes[1]}")
 
 
-def export(path: Path, directory: Path, method: str | None) -> Bundle:
-    """Write a checkpoint's bundle into a directory, the manifest last.
+def exportable(path: Path, directory: Path, method: str | None) -> tuple[Model, str]:
+    """Return the model of a checkpoint that may be exported to a directory, and the method.
 
     Raises:
-        UsageError: the model has no such planner, or its pictures are none that devices take.
+        UsageError: the model has no such planner, its pictures are none that devices take, or the
+            directory holds something else.
         MissingInputError: onnx, onnxscript or onnxruntime are not installed.
-        StorageError: the disk refused.
     """
     model = load_fp32(path)
     check_pictures(model, path)
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, f"export needs {module}", "export")
-    method = exported_method(model, method)
+    files.refuse_foreign(directory, "exported model", OURS.__contains__)
+    return model, exported_method(model, method)
+
+
+def export(path: Path, directory: Path, method: str | None) -> Bundle:
+    """Write a checkpoint's bundle into a directory, the manifest last.
+
+    Raises as :func:`exportable`, and StorageError where the disk refuses.
+    """
+    model, method = exportable(path, directory, method)
     kind, entries = model.plant, dict[str, Any]()
     files.make_directory(directory)
-    files.refuse_foreign(directory, "exported model", OURS.__contains__)
     with files.writing(directory):
         (directory / MANIFEST).unlink(missing_ok=True)  # a half-written bundle has none
     for name, (network, inputs, outputs) in networks_of(model, method).items():

@@ -73,6 +73,11 @@ class Trace:
             raise DataError(f"{path} holds no datagrams; expected a delay or {LOST} in every line")
         return cls(tuple(delays))
 
+    def latest_steps(self, step_ms: float) -> int:
+        """Return the whole steps that a datagram takes at most; 0 where all are lost."""
+        delays_ms = np.array(self.delays_ms)
+        return int(np.rint(np.max(delays_ms, initial=0.0, where=~np.isnan(delays_ms)) / step_ms))
+
     def draws(self, steps: int, devices: int, step_ms: float) -> tuple[LinkDraws, Any]:
         """Return what the trace does to the datagrams of a loop, for the simulator.
 

@@ -285,9 +285,9 @@ def test_an_empty_path_is_not_this_directory(shell, command):
 
 
 def test_a_view_takes_one_kind_of_link(shell):
-    both = ("view", "--gap", "5", "--delivery", "0.5")
-    refused(shell, 2, *both, says=["--gap", "--delivery", "give one"])
-    refused(shell, 2, *both, "--dry-run", says=["--gap", "--delivery", "give one"])
+    both = ("view", "--gap-steps", "5", "--delivery", "0.5")
+    refused(shell, 2, *both, says=["--gap-steps", "--delivery", "give one"])
+    refused(shell, 2, *both, "--dry-run", says=["--gap-steps", "--delivery", "give one"])
 
 
 @pytest.mark.parametrize("value", ["-1", "1.5", "nan", str(2**63)])

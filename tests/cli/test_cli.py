@@ -676,6 +676,11 @@ def test_models_verify_checks_what_is_named_or_everything(shell, zoo):
     assert both.code == 65 and "good: intact" in both.out  # one bad model hides no good one
     assert "sha256" in both.err and "Traceback" not in both.err
     assert shell("models", "verify", "torn", "--json").document["error"]["code"] == 65
+    several = shell("models", "verify", "torn", "nowhere", "good", "--quiet")
+    assert several.code == 65 and "good: intact" in several.out
+    assert several.err.startswith("error: 2 files are damaged or unreadable: ")
+    assert "torn" in several.err and "'nowhere'" in several.err
+    assert shell("models", "verify", "nowhere", "torn").code == 66
 
 
 def test_models_of_an_unknown_name_lists_the_zoo(shell, zoo):

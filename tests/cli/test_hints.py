@@ -10,8 +10,8 @@ from command_line import commands_in, follow
         ("hjepa models list", ["models list"]),
         ("free some disk space, then hjepa resume data/desktop-0001", ["resume data/desktop-0001"]),
         (
-            "hjepa view --gap 3, or hjepa view --delivery 0.1",
-            ["view --gap 3", "view --delivery 0.1"],
+            "hjepa view --gap-steps 3, or hjepa view --delivery 0.1",
+            ["view --gap-steps 3", "view --delivery 0.1"],
         ),
         ("hjepa resume runs/a shows it as it is; or choose another --out DIR", ["resume runs/a"]),
         ("run the same command again", []),

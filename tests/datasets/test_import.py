@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from command_line import ENVIRONMENT, assert_one_line_error, open_shell
 import hjepa_cli
 from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.resizing import area_means, fitted
+from hjepa_cli.stages import import_data
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
 SIZE = ("--size", recordings.H, recordings.W)
@@ -362,8 +364,30 @@ def test_an_import_that_is_killed_goes_on_and_ends_in_the_same_bytes(tmp_path):
             assert (tmp_path / "whole" / name).read_bytes() == (
                 tmp_path / "again" / name
             ).read_bytes()
-    # A source that has changed meanwhile is another one.
-    (tmp_path / "again" / "dataset.json").unlink()
+
+
+def test_an_unfinished_import_is_planned_and_refuses_pictures_that_were_replaced(
+    shell, tmp_path, monkeypatch
+):
+    """Nothing tells of them but their own size and time: those of the folder stay."""
+    frames, actions, _ = recordings.make(episodes=2, steps=9)
+    source = recordings.folder(tmp_path / "r", frames, actions)
+
+    def stopped(*given):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(import_data, "write_shards", stopped)
+        assert shell("data", "import", source, *SAID, "--out", "d").code == 130
+    with shell.untouched():
+        planned = shell("resume", "d", "--dry-run")
+    assert planned.code == 0 and "cut 2 episodes" in planned.out and "resume d" in planned.out
+    picture = source / "1_0004.png"
+    picture.write_bytes(picture.read_bytes())
+    for more in ((), ("--dry-run",)):
+        with shell.untouched():
+            outcome = shell("resume", "d", "--quiet", *more)
+        assert_one_line_error(outcome, 2, "the source has changed since d was begun", "delete d")
 
 
 def test_arrays_from_python(tmp_path, monkeypatch):
@@ -382,6 +406,15 @@ def test_arrays_from_python(tmp_path, monkeypatch):
     assert ragged.split("train").states.shape[-1] == 0
     with pytest.raises(hjepa_cli.errors.DataError, match="episode 0, row 2"):
         hjepa_cli.Dataset.from_arrays(frames, np.where(np.arange(9)[:, None] == 2, np.nan, actions))
+    bad = frames / 255
+    bad[3, 2, 0, 0, 0] = 40.0
+    for out in (None, "bad", "empty"):
+        Path("empty").mkdir(exist_ok=True)
+        with pytest.raises(hjepa_cli.errors.DataError, match="episode 3, row 2"):
+            hjepa_cli.Dataset.from_arrays(bad, actions, size=size, out=out)
+    left = sorted(str(path) for path in (*tmp_path.glob("data/*"), *tmp_path.glob("[be]*")))
+    assert left == [str(data.path.absolute()), str(tmp_path / "empty")]
+    assert not any(Path("empty").iterdir())
     assert (
         json.loads((data.path / "dataset.json").read_text())["config"]["import"]["format"]
         == "arrays"

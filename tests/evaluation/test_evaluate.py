@@ -427,7 +427,9 @@ def test_methods_are_built_in_one_thread_as_workers_do(monkeypatch: pytest.Monke
     assert seen == [1, 1] and torch.get_num_threads() == 2  # the teacher, too
 
 
-def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:
+def test_measured_points_agree_with_the_curves(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What ``scale --verify`` asks for: bracket devices at chosen gaps and probabilities."""
     settings = small(methods=("zero-true",), steps=200, gaps=(1, 8, 30), acceptable_score=0.9)
     result = evaluate.run(settings, Output().screen, checkpoint=str(checkpoint))
@@ -435,13 +437,28 @@ def test_measured_points_agree_with_the_curves(checkpoint: Path) -> None:
     gaps = [point["d"] for point in entry["gap_bracket"]]
     probabilities = [point["p"] for point in entry["delivery_bracket"]]
     subject = subject_of(settings, checkpoint)
-    measured = measuring.measure_points(
-        subject, Output().screen, method="zero-true", gaps=gaps, probabilities=probabilities
-    )
-    assert len(measured) == len(gaps) + len(probabilities) > 2
-    assert measured == entry["gap_bracket"] + entry["delivery_bracket"]
+    points = [Point("gap", gap) for gap in gaps]
+    points += [Point("delivery", 1 / p) for p in probabilities]
+    opened, driven, measure = [], [], Bench.__init__
+
+    def counted(self, *given):
+        driven.append(self)
+        measure(self, *given)
+
+    def opening(unit_steps):
+        opened.append(unit_steps)
+        return open_workers(unit_steps)
+
+    monkeypatch.setattr(Bench, "__init__", counted)
+    monkeypatch.setattr(measuring, "open_workers", opening)
+    asked = {"zero-true": points, "hold-true": points[:1], "zero": points[:1]}
+    measured = measuring.measure_points(subject, Output().screen, asked)
+    assert len(opened) == len(driven) == 1, "of all methods: the teacher is driven once"
+    assert len(points) == len(gaps) + len(probabilities) > 2
+    assert measured["zero-true"] == entry["gap_bracket"] + entry["delivery_bracket"]
+    assert [*measured] == [*asked] and len(measured["zero"]) == 1
     with pytest.raises(UsageError, match="no model for method 'ts-jepa-5'"):
-        measuring.measure_points(subject, Output().screen, method="ts-jepa-5", gaps=[1])
+        measuring.measure_points(subject, Output().screen, {"ts-jepa-5": points})
 
 
 @pytest.mark.parametrize("law", ["eval", "duty", "scheduled"])

@@ -262,18 +262,19 @@ def blocks(stage, monkeypatch):
     """Replace the closed loop: a score that falls by 0.3 per tolerance, ±0.02."""
     asked = []
 
-    def measure_points(subject, screen, *, method, gaps=(), probabilities=()):
-        asked.append((method, [*gaps], [*probabilities]))
-        measured = []
-        for key, kind, values in (("d", "gap_steps", gaps), ("p", "p", probabilities)):
-            for value in values:
-                share = value / ENTRIES[method][f"tolerance_{kind}"]
-                wider = share if key == "d" else 1 / share
-                score = 0.62 - blocks.slope * (wider - 1)
-                ci95 = [score - 0.02, score + 0.02]
-                measured.append(
-                    {key: value, "score": score, "ci95": ci95, "lq_ratio": 0.3, "n_devices": 256}
-                )
+    def measure_points(subject, screen, points):
+        measured = {name: [] for name in points}
+        for method, point in ((name, one) for name, of in points.items() for one in of):
+            kind = "gap_steps" if point.kind == "gap" else "p"
+            [(key, value)] = point.coordinate().items()
+            asked.append((method, value))
+            share = value / ENTRIES[method][f"tolerance_{kind}"]
+            wider = share if key == "d" else 1 / share
+            score = 0.62 - blocks.slope * (wider - 1)
+            ci95 = [score - 0.02, score + 0.02]
+            measured[method].append(
+                {key: value, "score": score, "ci95": ci95, "lq_ratio": 0.3, "n_devices": 256}
+            )
         return measured
 
     monkeypatch.setattr(scale_by_formula, "measure_points", measure_points)
@@ -285,7 +286,7 @@ def blocks(stage, monkeypatch):
 def test_verify_drives_both_sides_of_every_tolerance(stage, blocks, law):
     result = stage(law=law, verify=True, methods=("hjepa", "hold", "zero", "optimal", "oracle"))
     assert all(check["passed"] for check in result["verify"])
-    asked = {method: gaps or probabilities for method, gaps, probabilities in blocks.asked}
+    asked = {name: [value for of, value in blocks.asked if of == name] for name, _ in blocks.asked}
     assert asked.keys() == {"hjepa", "hold", "oracle"}  # zero and optimal have no tolerance
     tolerance = 112.0 if law == "duty" else 0.02
     assert asked["hjepa"] == pytest.approx([0.9 * tolerance, 1.1 * tolerance])
@@ -318,8 +319,7 @@ def test_verify_asks_for_no_more_than_a_packet_in_every_slot(stage, blocks, monk
     monkeypatch.setitem(ENTRIES, "zero", entry(gap=1.05, p=0.95))
     stage(verify=True, methods=("zero",))
     stage(verify=True, methods=("zero",), law="equal")
-    (_, gaps, _), (_, _, probabilities) = blocks.asked
-    assert gaps == pytest.approx([1.155]) and probabilities == pytest.approx([0.855])
+    assert blocks.asked == [("zero", pytest.approx(1.155)), ("zero", pytest.approx(0.855))]
 
 
 def test_real_curves_of_the_true_state_methods(tmp_path, monkeypatch):

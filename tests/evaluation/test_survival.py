@@ -12,7 +12,7 @@ from hjepa_cli.core.evaluation import survival
 from hjepa_cli.core.evaluation.simulator import Simulator
 from hjepa_cli.core.evaluation.survival import Gaps, LossCurve, LossyLink, Trial
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.errors import DataError, OutOfMemory, UsageError
+from hjepa_cli.errors import DataError, Interrupted, OutOfMemory, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import report, survive
 from hjepa_cli.storage import seals
@@ -205,6 +205,33 @@ def test_the_stage_ranks_prediction_over_holding(tmp_path, monkeypatch):
         with pytest.raises(DataError, match=r"result\.json lacks what a survive run has"):
             survive.run(settings, Screen(quiet=True), out=path.parent)
         path.write_text(whole)
+
+
+def test_an_interruption_loses_no_curve_that_was_measured(tmp_path, monkeypatch):
+    """The rest is measured, with the same result; a curve that was changed meanwhile is refused."""
+    monkeypatch.chdir(tmp_path)
+    settings = load_settings(flags=SETTINGS | {"survival.loops": 8})
+    whole = survive.run(settings, Screen(quiet=True), out=tmp_path / "whole")
+    measure, asked = survive.Survivals.measure, []
+
+    def stopped_at_the_second(self, method, interval):
+        asked.append(method)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return measure(self, method, interval)
+
+    monkeypatch.setattr(survive.Survivals, "measure", stopped_at_the_second)
+    with pytest.raises(Interrupted):
+        survive.run(settings, Screen(quiet=True), out=tmp_path / "cut")
+    again = survive.run(settings, Screen(quiet=True), out=tmp_path / "cut")
+    assert asked == ["oracle", "hold-true", "hold-true"]
+    assert [again[key] for key in ("rows", "curves")] == [whole[key] for key in ("rows", "curves")]
+
+    (tmp_path / "cut" / "result.json").unlink()
+    kept = tmp_path / "cut" / survive.FILE
+    kept.write_text(kept.read_text().replace('"lost": 0', '"lost": 1', 1))
+    with pytest.raises(DataError, match=r"survival\.json was changed after it was written"):
+        survive.run(settings, Screen(quiet=True), out=tmp_path / "cut")
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,7 @@
 | 19 | Ctrl-C and SIGTERM in training | test_resume.py::test_a_real_process_saves_and_says_how_to_go_on |
 | 19 | Ctrl-C and SIGTERM to a whole group | test_races.py::test_ctrl_c_leaves_no_process_behind_and_the_command_goes_on |
 | 19 | Ctrl-C leaves workers behind | test_evaluate.py::test_an_interrupt_ends_the_workers_at_once |
+| 19 | Ctrl-C loses what was measured of survival | test_survival.py::test_an_interruption_loses_no_curve_that_was_measured |
 | 19 | killed parent leaves workers behind | test_evaluate.py::test_workers_end_with_a_killed_parent |
 | 19 | processes of others ended with ours | test_races.py::test_the_caller_s_own_processes_survive_ours |
 | 19 | worker dies | test_executors.py::test_a_dead_worker_is_one_line |
@@ -91,6 +92,7 @@
 | 25 | any byte of a derived file changed | test_seals.py::test_no_mutation_changes_what_is_read |
 | 26 | code from the current directory | test_races.py::test_children_import_nothing_from_the_current_directory |
 | 27 | settings of a run changed under it | test_seals.py::test_settings_that_were_changed_are_named |
+| 27 | a run of other flags told as the answer | test_runs.py::test_a_run_with_other_flags_is_not_the_one_that_is_asked_for |
 | 27 | saved state of other settings | test_resume.py::test_a_state_goes_on_under_its_own_settings_only |
 | 28 | a setting that nothing reads | test_radio_input.py::test_what_the_law_would_not_read_is_refused_from_wherever_it_comes |
 | 28 | the same of one simulated uplink | test_api.py::test_a_simulated_cell_refuses_settings_that_it_does_not_read |

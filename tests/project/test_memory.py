@@ -54,10 +54,13 @@ def test_other_errors_stay_what_they_are(error) -> None:
         "view --devices 3 --config long.toml --preset smoke",
         "eval --methods oracle --config long.toml --preset smoke",
         "scale --methods oracle --config long.toml --preset smoke --law scheduled",
+        "reproduce --config long.toml --preset smoke",
+        "reproduce --config much.toml --preset smoke",
     ],
 )
 def test_sizes_beyond_the_memory_are_refused_before_any_work(hjepa, command) -> None:
     (hjepa.directory / "long.toml").write_text("[protocol]\nsteps = 900000000\n")
+    (hjepa.directory / "much.toml").write_text("[collect]\nsteps = 900000000\n")
     with hjepa.untouched():
         assert_one_line_error(hjepa(*command.split(), "--dry-run"), 70, "GB of memory")
     assert_one_line_error(hjepa(*command.split(), "--quiet"), 70, "GB of memory", "--dry-run")

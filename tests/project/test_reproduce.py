@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from command_line import assert_one_line_error, open_shell
 
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.errors import Interrupted, NumericalError
 from hjepa_cli.plugins import STAGES
 from hjepa_cli.stages import (
@@ -66,6 +67,19 @@ def test_the_stages_run_in_order_on_each_others_results(shell, calls):
         inputs["eval"]["checkpoint"] == inputs["scale"]["checkpoint"] == Path("f/train-hierarchy")
     )
     assert document["report"] == "f/report.html" and document["eval"] == {"stage": "eval"}
+
+
+def test_times_are_planned_as_they_were_measured():
+    """On two cores of a server; elsewhere they may be off by more, so within a half is enough."""
+    planned_s = {part.command: part.seconds for part in reproduce.parts(load_settings())}
+    trained_s = sum(planned_s[name] for name in ORDER[:3])
+    measured = {
+        "trainings": (trained_s, 11 * 60),
+        "train-encoder": (planned_s["train-encoder"], 399),
+        "eval": (planned_s["eval"], 9 * 60),
+    }
+    for name, (seconds, took_s) in measured.items():
+        assert took_s / 1.5 < seconds < 1.5 * took_s, name
 
 
 def test_a_finished_folder_prints_its_result_again(shell, calls):

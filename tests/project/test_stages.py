@@ -5,16 +5,23 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from command_line import ENVIRONMENT, Shell, assert_one_line_error, block, open_shell
 
 from hjepa_cli import plugins
-from hjepa_cli.cli.commands import LOOKS
+from hjepa_cli.cli.commands import COMMANDS, LOOKS
+from hjepa_cli.cli.flags import INPUTS
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.errors import Interrupted
+from hjepa_cli.errors import DataError, Interrupted
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import STAGES
+from hjepa_cli.stages import bench_link
+from hjepa_cli.stages.resume import given_to
+from hjepa_cli.storage.files import jsonable
+from hjepa_cli.storage.runs import Run
+from hjepa_cli.storage.zoo import resolve_model
 
 PLUGIN = block("plugins.md", "Stage(")
 
@@ -65,6 +72,92 @@ def test_a_stage_runs_and_plans_with_the_inputs_that_it_declares(name):
         }
         assert keywords.keys() - {*LOOKS} == {"out", *stage.inputs}
         assert all(parameter.default is not parameter.empty for parameter in keywords.values())
+
+
+@pytest.mark.parametrize("name", plugins.BUILT_IN["stage"])
+def test_the_flag_of_an_input_is_its_name(name):
+    """Hints make the flag of what a run recorded, and that is named as the keyword."""
+    [command] = [one for one in COMMANDS if one.name == name]
+    flags = {key.partition(":")[0]: INPUTS[key].name for key in command.takes if key in INPUTS}
+    for word in STAGES[name].inputs:
+        assert word == "further" or flags[word] == f"--{word.replace('_', '-')}"
+
+
+MODEL, OTHER = "desktop-h4m2l1", "desktop-reflex"
+BENCH = {
+    "model": Path("exported"),
+    "devices": 3,
+    "steps": 30,
+    "lockstep": True,
+    "gap_steps": 7,
+    "delivery": 0.5,
+    "trace": Path("trace"),
+    "harm": "kill",
+    "checkpoint": MODEL,
+    "backend": "torch",
+}
+GIVEN = [
+    ("train-encoder", {"dataset": Path("data")}),
+    ("train-hierarchy", {"dataset": Path("data"), "encoder": MODEL}),
+    ("train-reflex", {"dataset": Path("data"), "checkpoint": MODEL}),
+    ("train-fusion", {"dataset": Path("data"), "checkpoint": MODEL}),
+    ("eval", {"checkpoint": MODEL, "further": [OTHER], "dataset": Path("data"), "remeasure": True}),
+    ("eval", {"checkpoint": MODEL, "figure": True}),
+    ("scale", {"checkpoint": MODEL, "further": [OTHER], "dataset": Path("data"), "verify": True}),
+    ("scale", {"checkpoint": MODEL, "tolerance_steps": 7.5, "remeasure": True}),
+    ("survive", {"checkpoint": MODEL, "further": [OTHER]}),
+    ("bench-link", BENCH),
+    ("bench-link", {**BENCH, "lockstep": False, "period_ms": 7.5, "delivery": None}),
+]
+
+
+class Recorded(Exception):
+    """A run would have begun; ``inputs`` is what it would have recorded."""
+
+    def __init__(self, inputs):
+        super().__init__(inputs)
+        self.inputs = inputs
+
+
+@pytest.mark.parametrize(("name", "given"), GIVEN)
+def test_what_a_stage_was_given_is_what_resume_gives_it(name, given, shell, monkeypatch):
+    """Else it would go on with something else, without a word."""
+
+    def create(stage, out, settings, inputs):
+        raise Recorded(jsonable(inputs))
+
+    bundle = SimpleNamespace(digest=b"", frames=4, manifest={}, plant="desktop")
+    monkeypatch.setattr(bench_link, "open_bundle", lambda path: bundle)
+    monkeypatch.setattr(bench_link, "check_plant", lambda bundle, settings: None)
+    Path("trace").write_text("0\nlost\n")
+    methods = ("hjepa", "hold-decay") if "further" in given else ("hjepa",)
+    flags = {"methods": methods, "survival.intervals_steps": (10,)}
+    settings = load_settings("smoke", flags=flags)
+    if "dataset" in given:
+        STAGES["collect"].run(settings, Screen(quiet=True), out=Path("data"))
+    monkeypatch.setattr(Run, "create", create)
+    given = {word: resolve_model(one) if one == MODEL else one for word, one in given.items()}
+    if "further" in given:
+        given["further"] = [resolve_model(OTHER)]
+    with pytest.raises(Recorded) as caught:
+        STAGES[name].run(settings, Screen(quiet=True), **given)
+    again = given_to(STAGES[name], caught.value.inputs)
+    places = {word: one.absolute() for word, one in given.items() if isinstance(one, Path)}
+    places |= {"further": [one.absolute() for one in given.get("further", [])]}
+    asked = {word: one for word, one in (given | places).items() if one not in (None, False, [])}
+    assert {word: one for word, one in again.items() if one not in (None, False, [])} == asked
+
+
+def test_every_input_of_every_stage_is_given_above():
+    for name in plugins.BUILT_IN["stage"]:
+        given = {word for stage, words in GIVEN if stage == name for word in words}
+        assert given == {*STAGES[name].inputs}
+
+
+def test_resume_refuses_what_a_stage_does_not_take():
+    """As of another version, whose flag had another name."""
+    with pytest.raises(DataError, match="was given 'gap', which hjepa bench-link does not take"):
+        given_to(STAGES["bench-link"], {"devices": 3, "gap": 7})
 
 
 def test_a_stage_of_a_plugin_is_resumed_with_what_it_was_given(square, shell):

@@ -195,6 +195,28 @@ def test_a_finished_run_does_not_pretend_to_have_done_what_it_was_not_asked_for(
     assert "--out" in (caught.value.hint or "")
 
 
+@pytest.mark.parametrize("finished", [False, True])
+def test_a_run_with_other_flags_is_not_the_one_that_is_asked_for(finished: bool) -> None:
+    """But for those that ask for more of the same, or for a figure of it."""
+    trace = runs.describe_input(Path("trace"), "0" * 64)
+    given = {"tolerance_steps": 80.0, "delivery": None, "trace": trace, "figure": False}
+    with Run.create("scale", Path("out"), SETTINGS, given) as run:
+        if finished:
+            run.finish({})
+    for same in ({"tolerance_steps": 80, "figure": True}, {"of another version": 3}):
+        Run.create("scale", Path("out"), SETTINGS, given | same).close()
+    other = {
+        "tolerance_steps = 80.0, not 40.0": {"tolerance_steps": 40.0},
+        "tolerance_steps = 80.0, not None": {"tolerance_steps": None},
+        "delivery = None, not 0.5": {"delivery": 0.5},
+        "trace = '00.*, not '11": {"trace": trace | {"sha256": "1" * 64}},
+        "trace = '00.*, not None": {"trace": None},
+    }
+    for says, changes in other.items():
+        with pytest.raises(UsageError, match=says):
+            Run.create("scale", Path("out"), SETTINGS, given | changes)
+
+
 def test_an_unfinished_run_is_taken_up_again() -> None:
     with Run.create("eval", Path("out"), SETTINGS) as run:
         for epoch in range(5):

@@ -56,6 +56,16 @@ def shell(
     return open_shell(tmp_path, monkeypatch, capsys)
 
 
+def test_loops_of_every_packet_can_be_planned(workplace: Path) -> None:
+    """``run`` takes the only gap for a short one."""
+    inputs = {"dataset": workplace / "data", "checkpoint": str(workplace / "model.safetensors")}
+    often, usual = (
+        train_fusion.plan(small(**FUSION, **gaps), **inputs).seconds
+        for gaps in ({"protocol__gaps": (1,)}, {})
+    )
+    assert often > usual
+
+
 def test_loops_tell_the_truth_beside_packets_in_noise(workplace: Path) -> None:
     """Half of the packets are exact; the truth of a packet is its own clean picture's."""
     checkpoint = load_checkpoint(workplace / "run" / "model.safetensors")

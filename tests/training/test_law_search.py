@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import Shell, open_shell
+from command_line import Shell, assert_one_line_error, open_shell
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import Oracle
@@ -85,3 +85,18 @@ def test_the_command_writes_settings_for_the_next_one(hjepa: Shell) -> None:
     assert options.plant == "desktop" and len(options.control.ceiling_gains_n) == 4
     again = hjepa("tune-law", "--config", "c.toml", "--json", "--out", "again").document
     assert again["gains_n"] == result["gains_n"]
+
+
+def test_a_search_that_found_no_law_leaves_what_it_found(
+    hjepa: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Minutes of work; the same command would find the same."""
+    own = {True: gains_at_rest(plant("desktop").teacher(), 4).round(3), False: np.zeros((1, 4))}
+    monkeypatch.setattr(LawSearch, "gains_n", lambda self, *, learnable: own[learnable])
+    Path("c.toml").write_text("[tune]\ndevices = 2\nsteps = 40\n[protocol]\nwarmup_steps = 10\n")
+    outcome = hjepa("tune-law", "--config", "c.toml", "--out", "r", "--seed", "4", "--quiet")
+    says = ("control.ceiling_gains_n", "does not hold plant desktop", "more [tune] rounds than 24")
+    assert_one_line_error(outcome, 70, *says, "--seed 5")
+    written = tomllib.loads(Path("r/law.toml").read_text())["control"]
+    assert written == {"gains_n": own[True][0].tolist(), "ceiling_gains_n": [0.0] * 4}
+    assert not Path("r/result.json").exists()

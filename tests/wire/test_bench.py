@@ -1,10 +1,17 @@
 """The bench tells how long devices were without a controller, by the clock on the wall."""
 
+from types import SimpleNamespace
+
 import linear
 import numpy as np
 import pytest
 
+from hjepa_cli.config.settings import load_settings
+from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.stages import bench_link
 from hjepa_cli.wire import bench
+
+MODEL = "desktop-h4m2l1"
 
 
 def outcome(began_s, unplanned_until):
@@ -73,3 +80,58 @@ def test_devices_that_drive_themselves_do_not_rush(monkeypatch, actor, ends_afte
     began_s = bench.real_time(Busy(clock, actor), Quiet(), None, deadline=0.0)
     assert began_s[6] == pytest.approx(35 * linear.PERIOD_S)
     assert began_s[-1] == pytest.approx(ends_after * linear.PERIOD_S)
+
+
+@pytest.fixture
+def without_export(monkeypatch):
+    """An exported model of which nothing is asked."""
+    bundle = SimpleNamespace(frames=4, manifest={"checkpoint": {"sha256": "0" * 64}})
+    monkeypatch.setattr(bench_link, "open_bundle", lambda path: bundle)
+    monkeypatch.setattr(bench_link, "check_plant", lambda bundle, settings: None)
+
+
+@pytest.mark.parametrize(
+    ("flags", "text", "says"),
+    [
+        ({"protocol.delay_steps": 3}, None, "--delay-steps delays"),
+        ({"protocol.jitter_steps": 3}, None, "--jitter-steps delays"),
+        ({}, "0\nlost\n0.6\n", "--trace delays"),
+    ],
+)
+def test_delays_are_refused_where_the_wire_has_none(without_export, tmp_path, flags, text, says):
+    """The simulation would have them, and the difference would be told as one of the wire."""
+    trace = None
+    if text is not None:
+        (trace := tmp_path / "trace").write_text(text)
+    given = {"checkpoint": MODEL, "trace": trace}
+    for function in (bench_link.run, bench_link.plan):
+        more = {"screen": None} if function is bench_link.run else {}
+        with pytest.raises(UsageError, match=f"{says} .* in lockstep only") as caught:
+            function(load_settings(flags=flags), **more, **given)
+        assert "hjepa link" in caught.value.hint
+    assert bench_link.plan(load_settings(flags=flags), lockstep=True, **given).work
+
+
+def test_losses_and_delays_of_less_than_half_a_step_are_those_of_the_wire(without_export, tmp_path):
+    (tmp_path / "trace").write_text("0\nlost\n0.4\n")
+    options = load_settings(flags={"protocol.downlink_loss": 0.2})
+    assert bench_link.plan(options, checkpoint=MODEL, trace=tmp_path / "trace").work
+
+
+def test_a_trace_and_delays_are_two_links(without_export, tmp_path):
+    (tmp_path / "trace").write_text("0\n")
+    options = load_settings(flags={"protocol.delay_steps": 3})
+    with pytest.raises(UsageError, match="leave --delay-steps out"):
+        bench_link.plan(options, checkpoint=MODEL, trace=tmp_path / "trace", lockstep=True)
+
+
+def test_a_plan_refuses_and_takes_time_as_the_drive_does(without_export, tmp_path):
+    usual, slow, lockstep = (
+        bench_link.plan(load_settings(), checkpoint=MODEL, steps=3000, **given).seconds
+        for given in ({}, {"period_ms": 105.0}, {"lockstep": True})
+    )
+    assert slow - usual == pytest.approx(3000 * 0.1) and usual - lockstep == pytest.approx(15.0)
+    with pytest.raises(MissingInputError):
+        bench_link.plan(load_settings(), checkpoint=MODEL, trace=tmp_path / "no trace")
+    with pytest.raises(MissingInputError):
+        bench_link.plan(load_settings(), checkpoint="nowhere")

@@ -14,6 +14,7 @@ from command_line import ENVIRONMENT, assert_one_line_error, open_shell
 from hjepa_cli.wire.server import open_socket
 
 pytest.importorskip("onnxruntime")
+MODEL = "desktop-h4m2l1"
 HJEPA = [sys.executable, "-m", "hjepa_cli"]
 
 
@@ -38,6 +39,11 @@ def refused(shell, code, *arguments, says=()):
         (["export"], 2, ["--to DIR", "--check DIR"]),
         (["export", "--to", "new"], 2, ["which model?", "hjepa models list"]),
         (["export", "nothing", "--to", "new"], 66, ["nothing"]),
+        (["export", MODEL, "--to", "new", "--check", "m"], 2, ["--to DIR", "--check DIR"]),
+        (
+            ["export", MODEL, "--to", "new", "--method", "hold", "--quiet"],
+            *(2, ["cannot be exported as 'hold'"]),
+        ),
         (["export", "--check", "nowhere"], 66, ["no exported model", "hjepa export MODEL"]),
         (["serve"], 2, ["--model"]),
         (["serve", "--model", "nowhere"], 66, ["no exported model"]),
@@ -47,7 +53,7 @@ def refused(shell, code, *arguments, says=()):
         (["device", "--model", "m", "--server", "192.0.2.1:1"], 2, ["--key FILE"]),
         (["device", "--model", "m", "--server", "127.0.0.1:1", "--key", "k"], 66, ["k does not"]),
         (["device", "--model", "m", "--watchdog-ms", "100"], 2, ["from 0 to 80"]),
-        (["device", "--model", "m", "--gap", "9", "--innovation", "0.1"], 2, ["two rules"]),
+        (["device", "--model", "m", "--gap-steps", "9", "--innovation", "0.1"], 2, ["two rules"]),
         (["link", "--listen", "127.0.0.1:4747"], 2, ["same address"]),
         (["link", "--uplink-loss", "1"], 2, ["less than 1"]),
         (["link", "--uplink-loss", "0.9", "--uplink-burst", "2"], 2, ["bursts must last"]),
@@ -58,6 +64,8 @@ def refused(shell, code, *arguments, says=()):
 )
 def test_mistakes(shell, arguments, code, says):
     refused(shell, code, *arguments, says=says)
+    if arguments[0] == "export":
+        refused(shell, code, *arguments, "--dry-run", says=says)
 
 
 def test_a_readable_key_is_refused(shell, tmp_path):

@@ -3,10 +3,13 @@
 import contextlib
 import threading
 import time
+from types import SimpleNamespace
 
 import linear
 import numpy as np
 
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages import serve
 from hjepa_cli.wire import protocol
 from hjepa_cli.wire.device import Device
 from hjepa_cli.wire.server import Server, open_socket
@@ -104,3 +107,35 @@ def test_a_server_that_is_killed_and_started_again_takes_its_devices_up():
             drive(one, opened, address, z, lambda: one.counts["planned"] > before)
         assert time.monotonic() - started_s < BOUND_S
     assert protocol.SOURCES[one._last.source] == "planned"
+
+
+def test_a_scrape_sees_one_whole_snapshot(monkeypatch):
+    """It runs in a thread of its own: what it was given must not change under it."""
+    scrapes = []
+
+    @contextlib.contextmanager
+    def exposed(host, port, latest):
+        scrapes.append(latest)
+        yield host, port
+
+    class Reporting:
+        def __init__(self, controller, opened, report, say):
+            self._report = report
+
+        def run(self, until_s):
+            before = scrapes[0]()
+            self._report({"devices": 1})
+            assert before == {"devices": 0} and scrapes[0]() == {"devices": 1}
+
+    fakes = {
+        "open_bundle": lambda path: SimpleNamespace(plant="desktop", digest=b""),
+        "Runtime": lambda *given: SimpleNamespace(warm_up=lambda *names: None),
+        "Controller": lambda *given, **more: None,
+        "snapshot": lambda *given: {"devices": 0},
+        "Server": Reporting,
+    }
+    for name, fake in fakes.items():
+        monkeypatch.setattr(serve, name, fake)
+    monkeypatch.setattr(serve.prometheus, "exposed", exposed)
+    serve.run(Screen(quiet=True), model=None, bind="127.0.0.1:0", metrics="127.0.0.1:0")
+    assert len(scrapes) == 1

@@ -171,12 +171,16 @@ class Dataset:
             mirror=tuple(mirror_signs),
         )
         prepared = prepare({"train": recording}, options)
-        with open_directory(None if out is None else Path(out), RECORDED) as directory:
-            if (directory / MANIFEST).exists():
-                raise UsageError(f"{directory} holds a dataset already; choose another out")
+        place = None if out is None else Path(out)
+        existed = place is not None and place.exists()
+        with open_directory(place, RECORDED) as directory:
+            for name, what in ((MANIFEST, "a dataset"), (LOG, "an unfinished dataset")):
+                if (directory / name).exists():
+                    raise UsageError(f"{directory} holds {what} already; choose another out")
             definition = definition_of(prepared, camera)
-            made = write_shards(directory, prepared.assembly, definition)
-            return write_recording(directory, list(made), definition)
+            with undone(directory, BaseException, keep=existed):
+                made = write_shards(directory, prepared.assembly, definition)
+                return write_recording(directory, list(made), definition)
 
     @property
     def kind(self) -> System:
@@ -417,6 +421,23 @@ def open_directory(out: Path | None, plant_name: str) -> Iterator[Path]:
         )
     with files.lock_directory(directory):
         yield directory
+
+
+@contextlib.contextmanager
+def undone(directory: Path, errors: type[BaseException], *, keep: bool) -> Iterator[None]:
+    """Leave nothing of a dataset in the making, nor of its directory, after one of the errors.
+
+    ``keep`` leaves the directory, which was there before.
+    """
+    try:
+        yield
+    except errors:
+        for path in directory.iterdir():
+            if SHARD_NAME.fullmatch(path.name) or path.name in (LOG, files.LOCK_FILE):
+                path.unlink()
+        if not keep:
+            directory.rmdir()
+        raise
 
 
 def find_newest_dataset(root: Path, plant_name: str | None = None) -> Path | None:

@@ -79,16 +79,22 @@ def control_of(settings: Mapping[str, Any], where: object) -> ControlSettings:
 
 def check_stable(kind: System, gains_n: Floats, key: str) -> None:
     """Raise UsageError unless a law K [F, S] holds a plant at rest, heard at every step."""
+    if flaw := instability(kind, gains_n):
+        hint = f"hjepa tune-law --plant {kind.name}"
+        raise UsageError(f"{key} {flaw}", hint=hint, key=key)
+
+
+def instability(kind: System, gains_n: Floats) -> str | None:
+    """Say how a law K [F, S], heard at every step, fails to hold a plant at rest, if it does."""
     states = len(kind.state_names)
     a, b = linearise(kind.advance, np.zeros(states), np.zeros(kind.action_shape))
     growth = np.abs(np.linalg.eigvals(a - b @ gains_n)).max()
-    if growth >= 1:
-        raise UsageError(
-            f"{key} does not hold plant {kind.name}: near rest a deviation grows by a factor of "
-            f"{growth:.4f} a step",
-            hint=f"hjepa tune-law --plant {kind.name}",
-            key=key,
-        )
+    if growth < 1:
+        return None
+    return (
+        f"does not hold plant {kind.name}: near rest a deviation grows by a factor of "
+        f"{growth:.4f} a step"
+    )
 
 
 def _linear(kind: System, key: str, gains_n: tuple[float, ...]) -> LinearLaw:

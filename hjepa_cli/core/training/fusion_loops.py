@@ -5,6 +5,7 @@ it drives itself, round after round (data-set aggregation, Ross et al., AISTATS 
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -51,15 +52,20 @@ def listen(model: Model, posterior: nn.Module, settings: Settings, number: int) 
     return Heard(*(torch.cat([getattr(half, name) for half in halves]) for name in names))
 
 
+def ends_of_gaps(gaps: Sequence[int]) -> tuple[float, float]:
+    """Return the mean gaps, in steps, between which devices lie: short ones, and of the middle."""
+    return max(gaps[min(1, len(gaps) - 1)] / 2, 1.0), gaps[len(gaps) // 2]
+
+
 def _listen(
     model: Model, posterior: nn.Module, settings: Settings, number: int, *, exact: bool
 ) -> Heard:
-    options, gaps = settings.fusion, settings.protocol.gaps
+    options = settings.fusion
     protocol = dataclasses.replace(settings.protocol, warmup_steps=0, steps=options.loop_steps)
     seed = settings.seed + SEARCH_SEED + 2 * number + exact
     draws = Draws.make(protocol, options.devices, seed).on_device
-    # A device's mean gap lies, by its logarithm, evenly between short gaps and those of the middle.
-    shortest, longest = max(gaps[min(1, len(gaps) - 1)] / 2, 1.0), gaps[len(gaps) // 2]
+    # A device's mean gap lies, by its logarithm, evenly between the ends.
+    shortest, longest = ends_of_gaps(settings.protocol.gaps)
     share = generator(seed, GAP_KEY).uniform(size=options.devices)
     rates = 1 / (shortest * (longest / shortest) ** share)
     delivered = draws.delivery < rates

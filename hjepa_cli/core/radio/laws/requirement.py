@@ -13,7 +13,7 @@ class Axis:
 
     Attributes:
         key: of the tolerance in ``eval --json``; ``prefix`` is that of what is said about it.
-        point: key of a measured point; ``argument`` asks for some.
+        point: key of a measured point; ``kind`` is what such points are of.
         label, point_label, digits: in tables.
         fails_at: the tolerance of loops that fail with a packet in every slot.
     """
@@ -21,7 +21,7 @@ class Axis:
     key: str
     prefix: str
     point: str
-    argument: str
+    kind: str
     label: str
     point_label: str
     digits: int
@@ -43,12 +43,12 @@ class Axis:
 
 
 GAP = Axis(
-    *("tolerance_gap_steps", "tolerance_gap", "d", "gaps", "gap D* [steps]", "gap [steps]"),
+    *("tolerance_gap_steps", "tolerance_gap", "d", "gap", "gap D* [steps]", "gap [steps]"),
     digits=1,
     fails_at=0.0,
 )
 DELIVERY = Axis(
-    *("tolerance_p", "tolerance_p", "p", "probabilities", "delivery p*", "p"),
+    *("tolerance_p", "tolerance_p", "p", "delivery", "delivery p*", "p"),
     digits=4,
     fails_at=1.0,
 )
