@@ -60,7 +60,8 @@ def main() -> None:
     for delay in map(int, options.delays.split(",")):
         tuned = [name for name in methods if options.tune and name in TUNED]
         others = [name for name in methods if name not in tuned]
-        rows += counted(options, delay, others, options.checkpoint, "")
+        if others:
+            rows += counted(options, delay, others, options.checkpoint, "")
         if tuned:
             rows += counted(options, delay, tuned, tune(options, delay), "tuned")
         write(rows, options)
@@ -82,6 +83,9 @@ def counted(
         for name, entry in json.loads(path.read_text())["methods"].items()
     }
     step_ms = 1e3 * result["slot_s"]
+    over: dict[str, dict[str, Any]] = {}
+    for gain in result["gains"]:
+        over.setdefault(gain["method"], {})[gain["over"]] = [gain["ratio"], *gain["ratio_ci95"]]
     rows = []
     for row in result["rows"]:
         name = row["method"].partition("+")[0]
@@ -96,6 +100,7 @@ def counted(
                 "tolerance_gap_steps": entry["tolerance_gap_steps"],
                 "tolerance_gap_ci95": entry["tolerance_gap_ci95"],
                 "bits_per_transmission": row["bits_per_transmission"],
+                "devices_over": over.get(row["method"], {}),
                 "scores": scores,
                 "calls_per_step": calls(options, delay, name),
             }
