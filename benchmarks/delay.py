@@ -16,6 +16,7 @@ import argparse
 import csv
 import hashlib
 import json
+import math
 import shlex
 import sys
 import tomllib
@@ -23,6 +24,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from study import as_toml, hjepa
 
 from hjepa_cli.config.settings import load_settings
@@ -86,11 +88,15 @@ def counted(
     over: dict[str, dict[str, Any]] = {}
     for gain in result["gains"]:
         over.setdefault(gain["method"], {})[gain["over"]] = [gain["ratio"], *gain["ratio_ci95"]]
+    packets_per_step = max(
+        (r["devices"] / r["tolerance"] for r in result["rows"] if r["tolerance"]), default=0.0
+    )
     rows = []
     for row in result["rows"]:
         name = row["method"].partition("+")[0]
         entry = measured[row["method"]]
         scores = {f"{at['d']:g}": [at["score"], *at["ci95"]] for at in entry["gap_curve"]}
+        longest = longest_gap(entry["gap_curve"] + entry["gap_bracket"])
         rows.append(
             {
                 "delay_ms": delay * step_ms,
@@ -101,11 +107,27 @@ def counted(
                 "tolerance_gap_ci95": entry["tolerance_gap_ci95"],
                 "bits_per_transmission": row["bits_per_transmission"],
                 "devices_over": over.get(row["method"], {}),
+                "longest_gap_steps": longest,
+                "devices_at_longest": math.floor(longest * packets_per_step),
                 "scores": scores,
                 "calls_per_step": calls(options, delay, name),
             }
         )
     return rows
+
+
+def longest_gap(points: list[dict[str, Any]]) -> float:
+    """Return the longest gap that is acceptable, whatever shorter ones are.
+
+    A force that fades after a late packet can fail where packets come often, so that D* is 0, and
+    do well where they are rare.
+    """
+    gaps, scores = zip(*sorted((at["d"], at["score"]) for at in points), strict=True)
+    acceptable = load_settings().protocol.acceptable_score
+    last = max((at for at, score in enumerate(scores) if score >= acceptable), default=None)
+    if last is None or last == len(gaps) - 1:
+        return 0.0 if last is None else float(gaps[-1])
+    return float(np.interp(-acceptable, -np.array(scores[last : last + 2]), gaps[last : last + 2]))
 
 
 def tune(options: argparse.Namespace, delay: int) -> Path:
