@@ -435,7 +435,7 @@ def test_a_damaged_run_over_the_wire_is_refused(shell, change):
     made = finished(
         "bench-link",
         WIRE | change,
-        inputs={"model": {"path": "exported", "sha256": "0"}, "gap": 80},
+        inputs={"model": {"path": "exported", "sha256": "0"}, "gap_steps": 80},
     )
     assert_one_line_error(shell("report", made), 65, "lacks what a bench-link run has")
 

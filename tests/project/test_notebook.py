@@ -26,7 +26,7 @@ def test_the_cells_run_and_draw_what_they_say(tmp_path, monkeypatch):
     axes = known["axes"]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [*known["names"].values()]
     top = {line.get_label(): line.get_ydata()[-1] for line in axes.get_lines()}
-    assert top["perfect model"] > top["hold the last force"] > 0
+    assert top["perfect model"] > top["H-JEPA"] > top["fading reflex"] > 0
     pyplot.close("all")
 
 

@@ -17,6 +17,7 @@ import pytest
 import torch
 from command_line import ENVIRONMENT, Shell, assert_one_line_error, open_shell
 
+from hjepa_cli import plugins
 from hjepa_cli.compute.interrupts import Postponed, Terminated, sigterm_raises
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import load_settings
@@ -713,7 +714,9 @@ STAGES = ("train-encoder", "train-hierarchy", "eval", "scale", "reproduce")
 def test_a_dry_run_says_what_is_taken_up_and_takes_up_nothing(hjepa: Shell, stage: str) -> None:
     settings = load_settings("smoke", flags={"seed": 3})
     models = evaluate.open_measurable(settings, QUIET, None, None)
-    inputs = {"dataset": None, **models.inputs(remeasure=False)}
+    taken = plugins.STAGES[stage].inputs
+    given = {"dataset": None, **models.inputs(remeasure=False)}
+    inputs = {name: value for name, value in given.items() if name.partition(" ")[0] in taken}
     with runs.Run.create(stage, Path("r"), settings.as_dict(), inputs):
         pass
     with hjepa.untouched():
