@@ -16,8 +16,6 @@ from hjepa_cli.stages.models import missing_curves, verify
 from hjepa_cli.storage import seals, zoo
 from hjepa_cli.storage.checkpoints import MODEL_FILE, save_checkpoint
 
-BEFORE = ("desktop-supervised-2",)  # measured under another protocol, as cards say
-
 
 @pytest.fixture
 def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -138,7 +136,7 @@ def test_shipped_models_are_whole() -> None:
     for name in folders:
         assert zoo.verify_model(name).has_curves
         model = zoo.verify_model(name)
-        assert missing_curves(model) == [] or name in BEFORE, "hjepa eval --remeasure"
+        assert missing_curves(model) == [], "hjepa eval --remeasure"
         methods = set(json.loads((root / name / zoo.CURVES_FILE).read_text())["methods"])
         if model.metadata["architecture"]["kind"] == "hierarchy":
             assert methods >= {"hjepa", "ts-jepa-1", "hold", "oracle"}
