@@ -79,6 +79,20 @@ def test_the_claim_is_of_the_delays_that_were_measured():
     assert f"{100 * best['hjepa'] / best['oracle']:.0f} % of what a perfect model" in CLAIM
 
 
+def test_limits_of_pictures_are_those_that_were_measured():
+    """÷ the nominal score at a gap of 80 steps."""
+    stress = files.read_json(ROOT / f"docs/results/stress-{MODEL}.json")["stress"]
+    assert stress["gaps"][1] == 80
+    kept = {
+        row["condition"]: row["points"][1]["relative"] for row in stress["methods"]["hjepa"]["rows"]
+    }
+    mild = ("light=0.7", "light=1.3", "gamma=0.8", "gamma=1.25", "blur=1.5", "jpeg=75", "noise=8")
+    (said,) = re.findall(r"cost at most (\d+) % at gaps of 80\s+ms", TEXT)
+    assert round(100 * (1 - min(kept[name] for name in mild))) == int(said)
+    assert abs(kept["jitter=0.1"] - 0.5) < 0.05  # "halves the score"
+    assert max(kept["rotation=2"], kept["light=0.7+noise=8"]) < kept["jitter=0.1"]
+
+
 def test_scores_of_those_who_know_the_state_are_those_of_the_curves():
     entries = files.read_json(zoo.zoo_directory() / MODEL / zoo.CURVES_FILE)["methods"]
     page = (ROOT / "docs/reference/metrics.md").read_text()
