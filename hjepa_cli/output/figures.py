@@ -314,13 +314,19 @@ def training_figure(rows: Sequence[Mapping[str, str]], asked: Looks = looks.PLAI
 
 
 def _series(rows: Sequence[Mapping[str, str]], prefix: str) -> dict[str, list[tuple[float, float]]]:
-    """Return columns of ``metrics.csv`` by name without prefix; by level, if there are any."""
+    """Return columns of ``metrics.csv`` by name without prefix; by level, if there are any.
+
+    Rounds of one level are a single line, one after the other.
+    """
     series: dict[str, list[tuple[float, float]]] = {}
+    longest = max((float(row["step"]) for row in rows), default=0.0)
     for row in rows:
+        level, _, number = (row.get("level") or "").partition(" round ")
+        before = (int(number) - 1) * longest if number else 0.0
         for column, text in row.items():
             if column.startswith(prefix) and text:
-                name = row.get("level") or column.removeprefix(prefix).strip("_") or column
-                series.setdefault(name, []).append((float(row["step"]), float(text)))
+                name = level or column.removeprefix(prefix).strip("_") or column
+                series.setdefault(name, []).append((before + float(row["step"]), float(text)))
     return series
 
 

@@ -364,6 +364,15 @@ def test_training_figure_has_a_line_per_loss_level_and_health_measure():
     assert [line.get_label() for line in axes.lines] == ["high", "low"]
 
 
+def test_rounds_of_a_level_are_one_line_after_the_other():
+    rounds = [{"step": str(step), "level": f"fusion round {number}", "loss": f"{1 / number}"}
+              for number in (1, 2, 3) for step in (50, 100)]  # fmt: skip
+    (axes,) = figures.training_figure(rounds).axes
+    (line,) = axes.lines
+    assert line.get_label() == "fusion"
+    assert line.get_xdata().tolist() == [50, 100, 150, 200, 250, 300]
+
+
 def test_a_run_of_reflexes_has_its_section(shell, without_figures):
     windows = {"1-20": 0.0571, "21-40": 0.04}
     document = {
