@@ -15,9 +15,7 @@ from hjepa_cli.config.schema import IDEAL_LINK, ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 
 AHEAD_STEPS = 16  # forces in a datagram at most: its step's, and those of the next ones
-REMEMBERED_STEPS = (
-    512  # of which controllers, the wire's too, know what they sent; no packet may be later
-)
+REMEMBERED_STEPS = 512  # in which controllers know what they sent: no packet may be later
 STEP_BITS = FORCE_BITS = 16  # step numbers start again after 65,536
 
 
