@@ -16,7 +16,6 @@ import argparse
 import csv
 import hashlib
 import json
-import math
 import shlex
 import sys
 import tomllib
@@ -88,9 +87,6 @@ def counted(
     over: dict[str, dict[str, Any]] = {}
     for gain in result["gains"]:
         over.setdefault(gain["method"], {})[gain["over"]] = [gain["ratio"], *gain["ratio_ci95"]]
-    packets_per_step = max(
-        (r["devices"] / r["tolerance"] for r in result["rows"] if r["tolerance"]), default=0.0
-    )
     rows = []
     for row in result["rows"]:
         name = row["method"].partition("+")[0]
@@ -108,7 +104,6 @@ def counted(
                 "bits_per_transmission": row["bits_per_transmission"],
                 "devices_over": over.get(row["method"], {}),
                 "longest_gap_steps": longest,
-                "devices_at_longest": math.floor(longest * packets_per_step),
                 "scores": scores,
                 "calls_per_step": calls(options, delay, name),
             }
