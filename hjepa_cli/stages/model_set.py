@@ -11,13 +11,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from hjepa_cli.config.checks import needs_model, split_late, without_model
 from hjepa_cli.config.schema import RECORDED, Settings
 from hjepa_cli.core.control.drivers import as_trained, methods_of, offered_methods
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.evaluation.workers import ModelFile
-from hjepa_cli.core.networks.model import Model
+from hjepa_cli.core.networks.model import ON_EMBEDDINGS, Model
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.errors import DataError, HjepaError
 from hjepa_cli.output.screen import Screen
@@ -196,13 +198,22 @@ def open_model_set(
         others.append(ModelSet(under_law_of(other, settings), other, one, data))
         if others[-1].settings.control != settings.control:
             screen.say(f"{one} learned another law than {path or 'the settings'}")
-        encoder = other.metadata.get("encoder")  # models on raw frames need none
-        if model and encoder not in (None, model.digest, model.metadata.get("encoder")):
+        if model and not _embed_alike(model, other):
             screen.say(
                 f"{one} is on another encoder than {path}: trainings are compared, not "
                 f"methods; {how_to_train(methods_of(other)[0], settings)} trains it on this one"
             )
     return dataclasses.replace(first, further=tuple(others))
+
+
+def _embed_alike(one: Model, other: Model) -> bool:
+    """Return whether both have the same encoder to the bit, or one is no model on embeddings."""
+    if any(model.architecture["kind"] not in ON_EMBEDDINGS for model in (one, other)):
+        return True
+    ours, theirs = (model.networks["encoder"].state_dict() for model in (one, other))
+    return ours.keys() == theirs.keys() and all(
+        torch.equal(ours[name], theirs[name]) for name in ours
+    )
 
 
 def under_law_of(model: Model, settings: Settings) -> Settings:

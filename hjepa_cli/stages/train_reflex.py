@@ -21,7 +21,7 @@ from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.drivers import coder_of, methods_of
 from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.networks import health
-from hjepa_cli.core.networks.model import Model, load_modules
+from hjepa_cli.core.networks.model import ON_EMBEDDINGS, Model, load_modules
 from hjepa_cli.core.networks.reflex import Reflex
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.frames import WIDTH_PX
@@ -208,7 +208,7 @@ def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> C
     check_same_plant(checkpoint.metadata, settings, f"model {path}")
     architecture = checkpoint.metadata.get("architecture")
     kind = architecture.get("kind") if isinstance(architecture, dict) else None
-    if kind not in ("hierarchy", "flat", "reflex"):
+    if kind not in ON_EMBEDDINGS:
         raise DataError(
             f"{path} holds no actor on embeddings",
             hint="pass a --checkpoint of hjepa train-hierarchy",

@@ -293,14 +293,16 @@ def test_curves_of_a_baseline_are_complete_with_its_own_method(
 
 
 def test_a_model_on_another_encoder_is_said_to_be_one(tmp_path: Path, quick_encoder: None) -> None:
-    """A flat model that does not say that it is on the first one's encoder is none of its."""
     shipped = untrained(tmp_path / "zoo" / "hierarchy" / "model.safetensors")
-    deeper = flat(5)
-    output, settings = Output(), small(methods=("hjepa", "ts-jepa-5"))
+    deeper, said = flat(5), "is on another encoder than"
+    settings, output = small(methods=("hjepa", "ts-jepa-5")), Output()
+    ours, theirs = zoo.load_checkpoint(shipped), zoo.load_checkpoint(deeper)
+    encoder = {name: of for name, of in ours.tensors.items() if name.startswith("encoder.")}
+    save_checkpoint(deeper, theirs.tensors | encoder, theirs.metadata)
     open_model_set(settings, output.screen, str(shipped), None)
-    assert "another encoder" not in output.stderr.getvalue()  # it says nothing of its encoder
-    kept = zoo.load_checkpoint(deeper)
-    save_checkpoint(deeper, kept.tensors, {**kept.metadata, "encoder": "0" * 64})
+    assert said not in output.stderr.getvalue()
+    changed = {name: (of * 1.5).astype(of.dtype) for name, of in encoder.items()}
+    save_checkpoint(deeper, theirs.tensors | changed, theirs.metadata)
     open_model_set(settings, output.screen, str(shipped), None)
-    assert f"{deeper} is on another encoder than {shipped}" in output.stderr.getvalue()
+    assert f"{deeper} {said} {shipped}" in output.stderr.getvalue()
     assert "hjepa train-hierarchy --preset smoke --h 5" in output.stderr.getvalue()

@@ -53,6 +53,7 @@ LEVELS = {  # of each kind that has some, in the order of the checkpoint
     "hierarchy": ("high", "medium", "low", "flat"),
     "flat": ("high", "flat"),
 }
+ON_EMBEDDINGS = ("hierarchy", "flat", "reflex")  # kinds whose devices send what an encoder makes
 
 
 def build_modules(
