@@ -2,10 +2,11 @@
 
     python benchmarks/delay.py --out delay [--checkpoint MODEL] [--delays 0,10,20,30,40,60,80]
 
-For each delay ``hjepa scale --law duty`` counts the devices of a cell at one SNR. ``--tune`` first
-tunes ``hold-decay`` and ``hold-decay-linear`` to each delay with ``hjepa train-reflex``, so that
-what predicts nothing is at its best, too; their rows say ``tuned``. Settings of loops, and whatever
-else differs from the preset, come from ``--config``.
+For each delay ``hjepa scale --law duty`` counts the devices of a cell at one SNR. ``--tune 60,75``
+first tunes ``hold-decay`` and ``hold-decay-linear`` to each delay and each of these gaps with
+``hjepa train-reflex``, so that what predicts nothing is at its best, too; their rows say ``for 60``
+and are measured at gaps around it. Settings of loops, and whatever else differs from the preset,
+come from ``--config``.
 
 Everything is kept below ``--out``, a directory for each point: an interrupted study goes on with
 the same command, and more delays only add to it. All numbers go to ``OUT/delay.json``, the table to
@@ -31,6 +32,8 @@ from hjepa_cli.core.control.drivers import build_driver, methods_of
 from hjepa_cli.core.control.loop import LOOP_VERSION, Draws, gap_schedule, simulate
 from hjepa_cli.core.networks.model import LEVELS, Model
 from hjepa_cli.core.plants.conditions import actual_plant
+from hjepa_cli.core.radio.cell import Cell
+from hjepa_cli.core.radio.laws.duty import duty_devices
 from hjepa_cli.output import figures
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.files import write_json, write_text
@@ -39,6 +42,7 @@ from hjepa_cli.storage.zoo import resolve_model
 COMPARED = "hjepa,ts-jepa-1,ts-jepa-4,linear,chunk-forces,hold-decay,hold,oracle"
 LABEL = "Delay from a packet's capture to the force (ms)"
 TUNED = ("hold-decay", "hold-decay-linear")
+AROUND = (0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2, 1.4, 2.0)  # × the gap that is tuned to
 CALLS_AT = (20, 80)  # steps between packets where calls are counted
 CALLS_DEVICES, CALLS_STEPS = 8, 400
 
@@ -53,7 +57,7 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--config", type=Path, help="TOML file of other settings")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--tune", action="store_true", help="hold-decay to each delay")
+    parser.add_argument("--tune", default="", metavar="GAPS", help="hold-decay to these, in steps")
     parser.add_argument("--dataset", type=Path, help="for --tune")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -62,22 +66,26 @@ def main() -> None:
         tuned = [name for name in methods if options.tune and name in TUNED]
         others = [name for name in methods if name not in tuned]
         if others:
-            rows += counted(options, delay, others, options.checkpoint, "")
-        if tuned:
-            rows += counted(options, delay, tuned, tune(options, delay), "tuned")
+            rows += counted(options, delay, others, options.checkpoint)
+        for gap in map(int, options.tune.split(",") if tuned else ()):
+            rows += counted(options, delay, tuned, tune(options, delay, gap), gap)
         write(rows, options)
     print((options.out / "delay.csv").read_text())
 
 
 def counted(
-    options: argparse.Namespace, delay: int, methods: list[str], checkpoint: Any, note: str
+    options: argparse.Namespace, delay: int, methods: list[str], checkpoint: Any, made_for: int = 0
 ) -> list[dict[str, Any]]:
     """One row a method: devices, tolerated gap, scores, bits and calls at one delay."""
     words = ("--law", "duty", "--snr", options.snr, "--delay-steps", delay)
     words += ("--methods", ",".join(methods), "--checkpoint", checkpoint)
     where = point(options, "scale", *words)
+    config = options.config
+    if made_for:
+        gaps = [1, *sorted({round(share * made_for) for share in AROUND})]
+        config = settings_file(options, where, {"protocol": {"gaps": gaps}})
     words += ("--preset", options.preset, "--seed", options.seed, "--out", where)
-    result = hjepa("scale", *words, *(("--config", options.config) if options.config else ()))
+    result = hjepa("scale", *words, *(("--config", config) if config else ()))
     measured = {
         name: entry
         for path in where.glob("curves*.json")
@@ -92,54 +100,88 @@ def counted(
         name = row["method"].partition("+")[0]
         entry = measured[row["method"]]
         scores = {f"{at['d']:g}": [at["score"], *at["ci95"]] for at in entry["gap_curve"]}
-        longest = longest_gap(entry["gap_curve"] + entry["gap_bracket"])
+        longest, ends = longest_gap(entry["gap_curve"] + entry["gap_bracket"])
         rows.append(
             {
                 "delay_ms": delay * step_ms,
                 "method": row["method"],
-                "note": note,
+                "note": f"for {made_for}" if made_for else "",
                 **{key: row[key] for key in ("devices", "devices_ci95", "at_least", "reason")},
                 "tolerance_gap_steps": entry["tolerance_gap_steps"],
                 "tolerance_gap_ci95": entry["tolerance_gap_ci95"],
+                "longest_gap_steps": longest,
                 "bits_per_transmission": row["bits_per_transmission"],
                 "devices_over": over.get(row["method"], {}),
-                "longest_gap_steps": longest,
                 "scores": scores,
                 "calls_per_step": calls(options, delay, name),
             }
         )
+        if made_for:  # devices can keep to it, and shorter gaps do not count
+            rows[-1] |= {
+                "tolerance_gap_steps": longest,
+                "tolerance_gap_ci95": ends,
+                "devices": devices(options, row, longest),
+                "devices_ci95": [devices(options, row, end) for end in ends],
+                "reason": None,
+            }
     return rows
 
 
-def longest_gap(points: list[dict[str, Any]]) -> float:
-    """Return the longest gap that is acceptable, whatever shorter ones are.
+def longest_gap(points: list[dict[str, Any]]) -> tuple[float, list[float]]:
+    """Return the longest gap that is acceptable, whatever shorter ones are, and its interval.
 
     A force that fades after a late packet can fail where packets come often, so that D* is 0, and
-    do well where they are rare.
+    do well where they are rare. The interval is from the scores' own, point by point.
     """
-    gaps, scores = zip(*sorted((at["d"], at["score"]) for at in points), strict=True)
     acceptable = load_settings().protocol.acceptable_score
-    last = max((at for at, score in enumerate(scores) if score >= acceptable), default=None)
-    if last is None or last == len(gaps) - 1:
-        return 0.0 if last is None else float(gaps[-1])
-    return float(np.interp(-acceptable, -np.array(scores[last : last + 2]), gaps[last : last + 2]))
+    in_order = sorted(points, key=lambda at: at["d"])
+    gaps = np.array([at["d"] for at in in_order])
+
+    def crossing(scores: list[float]) -> float:
+        kept = [at for at, score in enumerate(scores) if score >= acceptable]
+        if not kept or kept[-1] == len(gaps) - 1:
+            return float(gaps[-1]) if kept else 0.0
+        around = slice(kept[-1], kept[-1] + 2)
+        return float(np.interp(-acceptable, -np.array(scores[around]), gaps[around]))
+
+    low, high = (crossing([at["ci95"][end] for at in in_order]) for end in (0, 1))
+    return crossing([at["score"] for at in in_order]), [low, high]
 
 
-def tune(options: argparse.Namespace, delay: int) -> Path:
-    """Where a model lies whose decaying holds were tuned to the delay; its chunks are untrained."""
-    given = tomllib.loads(options.config.read_text()) if options.config else {}
-    given["protocol"] = given.get("protocol", {}) | {"delay_steps": delay}
-    given["reflex"] = given.get("reflex", {}) | {"steps": 1}
+def devices(options: argparse.Namespace, row: dict[str, Any], gap_steps: float) -> int:
+    """How many devices send a packet so often, as ``duty`` counts them; 0 of gap 0."""
+    if not gap_steps:
+        return 0
+    settings = load_settings(options.preset, options.config)
+    cell = Cell.of(settings, actual_plant(settings.plant, settings.conditions))
+    link = cell.link(row["bits_per_transmission"], row["snr_db"])
+    return int(duty_devices(gap_steps, link.packets_per_slot))
+
+
+def tune(options: argparse.Namespace, delay: int, gap: int) -> Path:
+    """Where a model lies whose decaying holds were tuned to delay and gap; its chunks are not."""
     words = ("--checkpoint", options.checkpoint)
     words += ("--dataset", options.dataset) if options.dataset else ()
-    where = point(options, "train-reflex", *words, delay)
-    config = where.with_suffix(".toml")
-    alone = {key: given.pop(key) for key in list(given) if not isinstance(given[key], dict)}
-    lines = [f"{key} = {json.dumps(value)}\n" for key, value in alone.items()]
-    write_text(config, "".join(lines) + as_toml(given))
+    where = point(options, "train-reflex", *words, delay, gap)
+    reflex = {"steps": 1, "gap_steps": gap}  # the chunks' training is cut short
+    given = {"protocol": {"delay_steps": delay}, "reflex": reflex}
+    config = settings_file(options, where, given)
     named = ("--preset", options.preset, "--seed", options.seed, "--config", config)
     hjepa("train-reflex", *words, *named, "--out", where)
     return where
+
+
+def settings_file(
+    options: argparse.Namespace, where: Path, more: dict[str, dict[str, Any]]
+) -> Path:
+    """Where a file lies with the settings of ``--config`` and these."""
+    given = tomllib.loads(options.config.read_text()) if options.config else {}
+    given |= {section: given.get(section, {}) | values for section, values in more.items()}
+    alone = {key: given.pop(key) for key in list(given) if not isinstance(given[key], dict)}
+    lines = [f"{key} = {json.dumps(value)}\n" for key, value in alone.items()]
+    config = where.with_suffix(".toml")
+    write_text(config, "".join(lines) + as_toml(given))
+    return config
 
 
 def calls(options: argparse.Namespace, delay: int, name: str) -> dict[str, dict[str, float]]:

@@ -86,6 +86,12 @@ def check_settings(settings: Settings) -> None:
             f"protocol.gaps = {list(gaps)}; expected ascending steps from 1 on",
             key="protocol.gaps",
         )
+    if (gap := settings.reflex.gap_steps) > settings.reflex.search_steps:
+        raise UsageError(
+            f"reflex.gap_steps = {gap}, and reflex.search_steps = {settings.reflex.search_steps} "
+            "are scored; expected a gap no longer than that",
+            key="reflex.gap_steps",
+        )
     check_payload(settings.protocol.payload)
     _check_link(settings.protocol)
     _check_names(SCHEDULERS, settings.radio.schedulers, "radio.schedulers")

@@ -303,6 +303,7 @@ class ReflexSettings:
     fit_devices: Count = 24  # on embeddings, of a factor and the decay
     fit_candidates: Candidates = 12
     fit_rounds: Count = 3
+    gap_steps: CountOrNone = 0  # decays are made for this gap; 0: for the longest one
 
 
 @dataclasses.dataclass(frozen=True)

@@ -119,7 +119,8 @@ def plan(
     plans *= count_frames(data, settings, "train")
     samples = len(NETWORKS) * options.steps * options.batch_packets * options.batch_ages
     # Two laws and two decays are searched, each at a few gaps around the one that is looked for.
-    steps = 2 * len(decay_fit.AROUND) * (protocol.warmup_steps + options.search_steps)
+    gaps = 1 if options.gap_steps else len(decay_fit.AROUND)
+    steps = 2 * gaps * (protocol.warmup_steps + options.search_steps)
     laws = options.search_candidates * options.search_rounds * options.search_devices
     decays = options.fit_candidates * options.fit_rounds * options.fit_devices
     return plan_training(
@@ -308,7 +309,10 @@ def search_laws(settings: Settings, screen: Screen) -> tuple[Law, Trial, dict[st
     screen.say("searching laws whose force fades, on the true state")
     kind, devices = plant_of(settings), options.search_devices
     act = control_law(kind, settings.control)
-    trial = Trial.make(kind, act, protocol, devices=devices, steps=options.search_steps, seed=seed)
+    steps, gap_steps = options.search_steps, options.gap_steps
+    trial = Trial.make(
+        kind, act, protocol, devices=devices, steps=steps, seed=seed, gap_steps=gap_steps
+    )
     law, _ = decay_fit.search_law(trial, seed=seed, **searched)
     faded, gain = decay_fit.search_law(trial, seed=seed, tied=True, **searched)
     said = {

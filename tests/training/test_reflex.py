@@ -30,7 +30,7 @@ from hjepa_cli.core.training.decay_fit import Trial
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.core.training.progress import PROGRESS_FILE
 from hjepa_cli.core.training.search import best
-from hjepa_cli.errors import DataError, Interrupted
+from hjepa_cli.errors import DataError, Interrupted, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages import collect, resume, train_encoder, train_hierarchy, train_reflex
@@ -353,6 +353,23 @@ def test_searches_move_devices_as_the_loop_does(name: str, late: dict[str, int])
         shares = trial.shares(fading, true_state)
         rows = slice(number * len(trial.gaps), (number + 1) * len(trial.gaps))
         np.testing.assert_allclose(found[rows], shares, atol=1.5 / 60)
+
+
+def test_late_packets_are_met_by_a_force_that_is_made_for_one_gap() -> None:
+    """By the gap that is tolerated a search cannot tell candidates that fail at short ones."""
+    flags = {"protocol": "paper", "protocol.delay_steps": 40}
+    kind, options = plant("desktop"), load_settings(flags=flags).protocol
+    drawn = {"devices": 8, "steps": 300, "seed": 0}
+    trial = Trial.make(kind, kind.teacher(), options, gap_steps=60, **drawn)
+    assert trial.gaps.tolist() == [60.0]
+    assert Trial.make(kind, kind.teacher(), options, **drawn).gaps.tolist() != [60.0]
+    law, _ = decay_fit.search_law(trial, candidates=24, rounds=8, seed=0)
+    own = gains_at_rest(kind.teacher(), 4)
+    both = np.stack([law.gains_n, own]), np.array([law.tau_steps, law.tau_steps])
+    found, teacher = trial.quality(decay_fit.shares_of_laws(trial, *both))
+    assert found > teacher + 0.02
+    with pytest.raises(UsageError, match=r"gap_steps = 13, and reflex\.search_steps = 12"):
+        settings(reflex__gap_steps=13)
 
 
 def test_a_search_beats_the_law_that_it_starts_from() -> None:

@@ -1,5 +1,8 @@
 """A decaying hold is fitted by the gap that it tolerates, on devices that no evaluation draws.
 
+Where packets are late it can fail with a packet at every step, and do well with few: then no gap is
+tolerated, however short, and it is fitted by its score at one gap.
+
 Gains and decay belong together. A law that is right with a packet at every step is too slow for
 sparse ones; a stiffer law whose force fades in time is a pulse that leaves a device at rest. So
 both are searched at once, on the true state, where many candidates cost little. What a trained
@@ -60,11 +63,12 @@ class Trial:
         steps: int,
         seed: int,
         around: Sequence[float] = AROUND,
+        gap_steps: int = 0,
     ) -> "Trial":
         """Draw devices, and find the gaps to try them at: ``around`` what the law tolerates.
 
-        That is with the true state and the exact equations. The devices of the ``protocol`` all are
-        nominal here, and ``steps`` are scored after its warm-up.
+        That is with the true state and the exact equations; ``gap_steps`` are tried alone. The
+        ``protocol``'s devices all are nominal here, and ``steps`` are scored after its warm-up.
         """
         nominal = dataclasses.replace(protocol, steps=steps, plant_spread=0.0)
         draws = Draws.make(nominal, devices, seed + SEARCH_SEED)
@@ -82,7 +86,8 @@ class Trial:
         scores = ratio(shares(law, grid, draws), teacher)
         tolerated = float(first_crossing(grid, scores, protocol.acceptable_score, log=False))
         tolerated = float(np.clip(tolerated, grid[min(1, len(grid) - 1)], grid[-1]))
-        gaps = np.clip(np.array(around) * tolerated, 1.0, steps)
+        tried = np.array([gap_steps]) if gap_steps else np.array(around) * tolerated
+        gaps = np.clip(tried.astype(float), 1.0, steps)
         return cls(kind, law, draws, gaps, protocol.acceptable_score, teacher)
 
     def first(self, devices: int) -> "Trial":
