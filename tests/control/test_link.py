@@ -116,6 +116,51 @@ def test_devices_play_the_newest_datagram_that_reached_them(
             assert played[device] == expected
 
 
+def test_forces_that_are_lost_were_sent_ahead_and_planned_once() -> None:
+    """With one packet, at the first step, every later force is in the datagrams before it.
+
+    Devices then play the exact law while no more than 15 datagrams in a row are lost. Every stride
+    is planned once, some of them before their time.
+    """
+    random = np.random.default_rng(0)
+    steps, devices = 60, 6
+    lost = random.random((steps, devices)) < 0.6
+    lost[::12] = False  # never sixteen in a row
+    planner = ExactPlanner()
+    planned: list[int] = []
+    plan = planner.plan
+    planner.plan = lambda z: (planned.append(len(z)), plan(z))[1]  # type: ignore[method-assign, func-returns-value]
+    controller = StrideController(planner, devices)
+    link = Link(LinkDraws(0, None, lost), controller)
+    z = torch.from_numpy(random.normal(size=(devices, 3)))
+    for k in range(steps):
+        sent = np.full(devices, k == 0)
+        forces_n = link.forces_n(sent, z if k == 0 else None)
+        assert np.abs(forces_n - (z @ GAINS).clamp(-2, 2).numpy()).max() < 1e-3  # rounded forces, one after the other
+        z = z @ A.T + torch.from_numpy(forces_n)[:, None] * B
+    assert sum(planned) == devices * (steps // 4 + -(-(AHEAD_STEPS - 1) // 4))
+
+
+def test_a_reflex_tells_the_forces_that_it_will_play_without_a_packet() -> None:
+    """It is driven on without one: what it told at every step is what it plays then."""
+    random = np.random.default_rng(0)
+    controller, devices = ReflexController(Fading(), 4), 4
+    told: dict[int, np.ndarray] = {}
+    for k in range(60):
+        sent = random.random(devices) < 0.1 if k else np.ones(devices, bool)
+        packets = torch.from_numpy(random.normal(size=(int(sent.sum()), 4))).float()
+        played = controller.act(sent, packets if sent.any() else None)
+        for device in np.flatnonzero(~sent):  # of what was told, all since its last packet holds
+            assert played[device] == pytest.approx(told[device][0], abs=1e-6)
+        ahead_n = controller.ahead_n()
+        assert ahead_n.shape == (devices, AHEAD_STEPS)
+        assert np.array_equal(ahead_n[:, 0], played)
+        for device in range(devices):
+            if not sent[device]:
+                assert ahead_n[device, :-1] == pytest.approx(told[device][: AHEAD_STEPS - 1], abs=1e-6)
+            told[device] = ahead_n[device, 1:]
+
+
 @given(st.integers(1, 7), st.integers(1, 30), st.data())
 def test_sent_forces_by_brute_force(remembered: int, steps: int, data: st.DataObject) -> None:
     sent, noted = SentForces(3, remembered, ()), np.arange(1.0, 1 + 3 * steps).reshape(steps, 3)

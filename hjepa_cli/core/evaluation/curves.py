@@ -19,6 +19,7 @@ import msgspec
 
 from hjepa_cli.config.checks import LATE
 from hjepa_cli.config.schema import CollectSettings, Settings
+from hjepa_cli.core.control.link import AHEAD_STEPS
 from hjepa_cli.core.control.loop import LOOP_VERSION
 from hjepa_cli.core.plants.conditions import altered
 from hjepa_cli.core.plants.named import definition
@@ -100,6 +101,8 @@ class Digest:
             fitted.append(_starts(values["collect"]))
         if wrong := _belief_steps(settings):
             fitted.append(wrong)
+        if settings.protocol.downlink_loss:  # how far ahead forces are planned, which matters there
+            measured["ahead_steps"] = AHEAD_STEPS
         payload = settings.protocol.payload
         if CODECS[payload].fitted or settings.protocol.false_alarm:
             measured["fitted"] = fitted
