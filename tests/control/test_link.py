@@ -141,26 +141,6 @@ def test_forces_that_are_lost_were_sent_ahead_and_planned_once() -> None:
     assert sum(planned) == devices * (steps // 4 + -(-(AHEAD_STEPS - 1) // 4))
 
 
-def test_a_reflex_tells_the_forces_that_it_will_play_without_a_packet() -> None:
-    """It is driven on without one: what it told at every step is what it plays then."""
-    random = np.random.default_rng(0)
-    controller, devices = ReflexController(Fading(), 4), 4
-    told: dict[int, np.ndarray] = {}
-    for k in range(60):
-        sent = random.random(devices) < 0.1 if k else np.ones(devices, bool)
-        packets = torch.from_numpy(random.normal(size=(int(sent.sum()), 4))).float()
-        played = controller.act(sent, packets if sent.any() else None)
-        for device in np.flatnonzero(~sent):  # of what was told, all since its last packet holds
-            assert played[device] == pytest.approx(told[device][0], abs=1e-6)
-        ahead_n = controller.ahead_n()
-        assert ahead_n.shape == (devices, AHEAD_STEPS)
-        assert np.array_equal(ahead_n[:, 0], played)
-        for device in range(devices):
-            if not sent[device]:
-                assert ahead_n[device, :-1] == pytest.approx(told[device][: AHEAD_STEPS - 1], abs=1e-6)
-            told[device] = ahead_n[device, 1:]
-
-
 @given(st.integers(1, 7), st.integers(1, 30), st.data())
 def test_sent_forces_by_brute_force(remembered: int, steps: int, data: st.DataObject) -> None:
     sent, noted = SentForces(3, remembered, ()), np.arange(1.0, 1 + 3 * steps).reshape(steps, 3)
@@ -240,6 +220,21 @@ CONTROLLERS: dict[str, tuple[Callable[[int], Any], Callable[[np.ndarray], Any]]]
     "hold": (lambda n: LastForce(TEACHER, n), true_state),
     "fading": (lambda n: LastForce(TEACHER, n, tau_steps=8.0, force_limit_n=20.0), true_state),
 }
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_what_is_told_of_the_next_steps_is_what_is_played_without_a_packet(name: str) -> None:
+    random, devices = np.random.default_rng(0), 4
+    build, sensor = CONTROLLERS[name]
+    controller, told = build(devices), np.zeros((devices, AHEAD_STEPS))
+    for k in range(60):
+        sent = random.random(devices) < 0.1 if k else np.ones(devices, bool)
+        seen = random.normal(scale=0.05, size=(int(sent.sum()), 16, 4))
+        played = controller.act(sent, sensor(seen) if sent.any() else None)
+        ahead_n = controller.ahead_n()
+        assert ahead_n.shape == told.shape and np.array_equal(ahead_n[:, 0], played)
+        assert ahead_n[~sent, :-1] == pytest.approx(told[~sent, 1:], abs=1e-5)
+        told = ahead_n
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

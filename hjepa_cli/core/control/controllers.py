@@ -363,6 +363,27 @@ class LastForce:
         return np.clip(self._played_n[:, None] * kept, -self._limit_n, self._limit_n)
 
 
+def told_ahead(
+    played_n: Floats,
+    states: Floats,
+    answer: Callable[[Floats], Floats],
+    moved: Callable[[Floats, Floats], Floats],
+) -> Floats:
+    """Return the forces [n, L, *A] of a step and of the next ones, from the states [n, S] after it.
+
+    Args:
+        played_n: forces of the step [n, *A].
+        states: where devices are believed to be then.
+        answer: states → forces_n.
+        moved: states and the forces of a step → states after it.
+    """
+    forces_n = [played_n]
+    for _ in range(AHEAD_STEPS - 1):
+        forces_n.append(answer(states))
+        states = moved(states, forces_n[-1])
+    return np.stack(forces_n, axis=1)
+
+
 class Oracle:
     """Plays the true state at each packet and exact equations in between: a predictor's ceiling.
 
@@ -390,6 +411,7 @@ class Oracle:
     ) -> None:
         self._actor, self._advance, self._limit_n = actor, advance, force_limit_n
         self._states = np.zeros((devices, states))
+        self._played_n = np.zeros((devices, *action_shape))
         self._sent = SentForces(devices, REMEMBERED_STEPS, action_shape)
 
     def act(self, delivered: Bools, packets: Floats | None, ages: Integers | None = None) -> Floats:
@@ -398,15 +420,22 @@ class Oracle:
             if ages is not None:
                 packets = self._follow(packets, np.flatnonzero(delivered), ages)
             self._states[delivered] = packets
-        forces_n = self.planned_n()
-        self._states = self._moved(self._states, forces_n)
+        self._played_n = self.planned_n()
+        self._states = self._moved(self._states, self._played_n)
         if ages is not None:
-            self._sent.note(forces_n)
-        return forces_n
+            self._sent.note(self._played_n)
+        return self._played_n
 
     def planned_n(self) -> Floats:
         """Return the forces [n, *A] of the coming step if no packet comes."""
-        return np.clip(self._actor(self._states), -self._limit_n, self._limit_n)
+        return self._answer(self._states)
+
+    def ahead_n(self) -> Floats:
+        """Return the forces [n, L, *A] of the last step and of the next ones if no packet comes."""
+        return told_ahead(self._played_n, self._states, self._answer, self._moved)
+
+    def _answer(self, states: Floats) -> Floats:
+        return np.clip(self._actor(states), -self._limit_n, self._limit_n)
 
     def _follow(self, states: Floats, devices: Integers, ages: Integers) -> Floats:
         """Move late packets on to the present under the forces that were sent meanwhile."""
