@@ -136,7 +136,9 @@ def test_forces_that_are_lost_were_sent_ahead_and_planned_once() -> None:
     for k in range(steps):
         sent = np.full(devices, k == 0)
         forces_n = link.forces_n(sent, z if k == 0 else None)
-        assert np.abs(forces_n - (z @ GAINS).clamp(-2, 2).numpy()).max() < 1e-3  # rounded forces, one after the other
+        assert (
+            np.abs(forces_n - (z @ GAINS).clamp(-2, 2).numpy()).max() < 1e-3
+        )  # rounded forces, one after the other
         z = z @ A.T + torch.from_numpy(forces_n)[:, None] * B
     assert sum(planned) == devices * (steps // 4 + -(-(AHEAD_STEPS - 1) // 4))
 

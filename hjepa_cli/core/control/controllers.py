@@ -65,7 +65,9 @@ class _Strides:
         """Return the forces [n, L, *A] of the last step and of the next ones if no packet comes."""
         further = -(-(AHEAD_STEPS - 1) // self._stride)
         if not self._later_n.shape[1]:
-            self._later_n = self._forces_n.new_zeros(len(self._phase), further, *self._forces_n.shape[1:])
+            self._later_n = self._forces_n.new_zeros(
+                len(self._phase), further, *self._forces_n.shape[1:]
+            )
         for number in range(further):
             rows = np.flatnonzero(self._heard & (self._ready == number))
             if len(rows):
@@ -93,7 +95,7 @@ class _Strides:
         raise NotImplementedError
 
     def _plan_later(self, rows: Integers, number: int) -> Tensor:
-        """Return forces_n [m, stride, *A] of the stride behind the present one and ``number`` more."""
+        """Return forces_n [m, stride, *A] of the stride ``number`` + 1 after the present one."""
         raise NotImplementedError
 
     def _go_on(self, rows: Tensor) -> None:
@@ -175,7 +177,9 @@ class StrideController(_Strides):
 
     def _plan_later(self, rows: Integers, number: int) -> Tensor:
         if not self._later_z.shape[1]:
-            self._later_z = self._z.new_zeros(len(self._z), self._later_n.shape[1], self._z.shape[1])
+            self._later_z = self._z.new_zeros(
+                len(self._z), self._later_n.shape[1], self._z.shape[1]
+            )
         at = torch.from_numpy(rows)
         before = self._later_z[at, number - 1] if number else self._z[at]
         forces_n, self._later_z[at, number] = self._planner.plan(before)
@@ -294,7 +298,10 @@ class ReflexController(_Strides):
     def _plan_later(self, rows: Integers, number: int) -> Tensor:
         """Plan as if all that is planned before had been sent."""
         at, first = torch.from_numpy(rows), self._ages[rows] - self._phase[rows]
-        sent_n, before_n = self._sent_n[at], [self._forces_n[at], *self._later_n[at, :number].unbind(1)]
+        sent_n, before_n = (
+            self._sent_n[at],
+            [self._forces_n[at], *self._later_n[at, :number].unbind(1)],
+        )
         steps = torch.from_numpy(first)[:, None] + torch.arange((number + 1) * self._stride)
         known = steps < sent_n.shape[1]
         of, _ = torch.where(known)
