@@ -127,6 +127,7 @@ class StrideController(_Strides):
 
     Attributes:
         taken: whose stride started anew at a packet in the last step [n].
+        stride_steps: what a stride takes; late packets are best taken whole strides old.
     """
 
     def __init__(
@@ -139,6 +140,7 @@ class StrideController(_Strides):
     ) -> None:
         super().__init__(planner.stride, devices, action_shape)
         self._planner, self._starts = planner, self._z
+        self.stride_steps = planner.stride
         self._later_z = torch.zeros(devices, 0, 0)  # where the strides planned already lead to
         self.check = check(devices) if check else None
         self.taken = np.zeros(devices, dtype=bool)

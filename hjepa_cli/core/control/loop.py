@@ -181,11 +181,6 @@ class LinkDraws:
         return dataclasses.replace(self, extra_steps=extra, lost=lost)
 
     @property
-    def jitter_steps(self) -> int:
-        """Return the most that any packet takes besides."""
-        return 0 if self.extra_steps is None else int(self.extra_steps.max(initial=0))
-
-    @property
     def _drawn(self) -> tuple[Any, Any]:
         return self.extra_steps, self.lost
 
@@ -202,6 +197,9 @@ class Link:
     force is decided so long before its step that most likely one of the datagrams until then tells
     of it. To that controller all packets are so much later.
 
+    A controller with ``stride_steps`` gets a late packet when it is whole strides old: to move it
+    on by the few steps that are left costs more than to wait for so long.
+
     Args:
         draws: of these devices.
         controller: drives them.
@@ -212,15 +210,21 @@ class Link:
     """
 
     def __init__(self, draws: LinkDraws, controller: Controller, delay_steps: int = 0) -> None:
-        delay_steps += draws.delay_steps
-        late = delay_steps > 0 or draws.extra_steps is not None
-        self._in_flight = InFlight(delay_steps, draws.extra_steps) if late else None
+        delay_steps, extra_steps = delay_steps + draws.delay_steps, draws.extra_steps
         self._downlink = None if draws.lost is None else Downlink(draws.lost)
         self._controller = controller
         self._lead_steps = draws.lead_steps if takes_ages(controller) else 0
         self._decided: deque[Floats] = deque(maxlen=self._lead_steps + 1)  # until the next step's
+        stride = getattr(controller, "stride_steps", 1)
+        if extra_steps is None:
+            delay_steps += -(delay_steps + self._lead_steps) % stride
+        else:
+            extra_steps = extra_steps + -(delay_steps + self._lead_steps + extra_steps) % stride
+        late = delay_steps > 0 or extra_steps is not None
+        self._in_flight = InFlight(delay_steps, extra_steps) if late else None
         self._told = (late or self._lead_steps > 0) and takes_ages(controller)
-        latest = delay_steps + draws.jitter_steps + self._lead_steps
+        latest = delay_steps + self._lead_steps
+        latest += 0 if extra_steps is None else int(extra_steps.max(initial=0))
         if self._told and latest > REMEMBERED_STEPS:
             raise UsageError(
                 f"packets may come {latest} steps late; a controller remembers what it sent in the "
