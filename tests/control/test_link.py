@@ -32,6 +32,7 @@ from hjepa_cli.core.control.link import (
     confirmation_bits,
     described,
     facts,
+    lead_steps,
 )
 from hjepa_cli.core.control.loop import (
     Draws,
@@ -116,6 +117,66 @@ def test_devices_play_the_newest_datagram_that_reached_them(
             assert played[device] == expected
 
 
+def test_forces_that_are_lost_were_sent_ahead_and_planned_once() -> None:
+    """With one packet, at the first step, every later force is in the datagrams before it.
+
+    Devices then play the exact law while no more than 15 datagrams in a row are lost. Every stride
+    is planned once, some of them before their time.
+    """
+    random = np.random.default_rng(0)
+    steps, devices = 60, 6
+    lost = random.random((steps, devices)) < 0.6
+    lost[::12] = False  # never sixteen in a row
+    planner = ExactPlanner()
+    planned: list[int] = []
+    plan = planner.plan
+    planner.plan = lambda z: (planned.append(len(z)), plan(z))[1]  # type: ignore[method-assign, func-returns-value]
+    controller = StrideController(planner, devices)
+    link = Link(LinkDraws(0, None, lost), controller)
+    z = torch.from_numpy(random.normal(size=(devices, 3)))
+    for k in range(steps):
+        sent = np.full(devices, k == 0)
+        forces_n = link.forces_n(sent, z if k == 0 else None)
+        assert (
+            np.abs(forces_n - (z @ GAINS).clamp(-2, 2).numpy()).max() < 1e-3
+        )  # rounded forces, one after the other
+        z = z @ A.T + torch.from_numpy(forces_n)[:, None] * B
+    assert sum(planned) == devices * (steps // 4 + -(-(AHEAD_STEPS - 1) // 4))
+
+
+def test_devices_play_what_was_decided_while_as_many_datagrams_are_not_lost_in_a_row() -> None:
+    """Pushes between packets make each packet a surprise, which the next force is to answer."""
+    random = np.random.default_rng(0)
+    steps, devices, lead = 90, 6, 3
+    lost = random.random((steps, devices)) < 0.5
+    lost[:: lead + 1] = False
+    decided: list[np.ndarray] = []
+
+    class Noting(StrideController):
+        def act(self, delivered: Any, packets: Any, ages: Any = None) -> Any:
+            decided.append(super().act(delivered, packets, ages))
+            return decided[-1]
+
+    controller = Noting(ExactPlanner(), devices)
+    link = Link(LinkDraws(0, None, lost, lead), controller)
+    z = torch.from_numpy(random.normal(size=(devices, 3)))
+    for k in range(steps):
+        sent = np.ones(devices, bool) if k == 0 else random.random(devices) < 0.1
+        forces_n = link.forces_n(sent, z[torch.from_numpy(sent)] if sent.any() else None)
+        answer = decided[k - lead] if k >= lead else np.zeros(devices)
+        assert np.array_equal(forces_n, answer)
+        z = z @ A.T + torch.from_numpy(forces_n)[:, None] * B
+        z += torch.from_numpy(random.normal(scale=0.1, size=z.shape))
+
+
+@pytest.mark.parametrize(("loss", "steps"), [(0.0, 0), (0.01, 0), (0.2, 2), (0.5, 4), (0.9, 7)])
+def test_the_more_datagrams_are_lost_the_earlier_is_a_force_decided(
+    loss: float, steps: int
+) -> None:
+    assert lead_steps(loss) == steps
+    assert loss ** (steps + 1) <= 1 / 32 or steps + 1 == AHEAD_STEPS // 2
+
+
 @given(st.integers(1, 7), st.integers(1, 30), st.data())
 def test_sent_forces_by_brute_force(remembered: int, steps: int, data: st.DataObject) -> None:
     sent, noted = SentForces(3, remembered, ()), np.arange(1.0, 1 + 3 * steps).reshape(steps, 3)
@@ -195,6 +256,21 @@ CONTROLLERS: dict[str, tuple[Callable[[int], Any], Callable[[np.ndarray], Any]]]
     "hold": (lambda n: LastForce(TEACHER, n), true_state),
     "fading": (lambda n: LastForce(TEACHER, n, tau_steps=8.0, force_limit_n=20.0), true_state),
 }
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_what_is_told_of_the_next_steps_is_what_is_played_without_a_packet(name: str) -> None:
+    random, devices = np.random.default_rng(0), 4
+    build, sensor = CONTROLLERS[name]
+    controller, told = build(devices), np.zeros((devices, AHEAD_STEPS))
+    for k in range(60):
+        sent = random.random(devices) < 0.1 if k else np.ones(devices, bool)
+        seen = random.normal(scale=0.05, size=(int(sent.sum()), 16, 4))
+        played = controller.act(sent, sensor(seen) if sent.any() else None)
+        ahead_n = controller.ahead_n()
+        assert ahead_n.shape == told.shape and np.array_equal(ahead_n[:, 0], played)
+        assert ahead_n[~sent, :-1] == pytest.approx(told[~sent, 1:], abs=1e-5)
+        told = ahead_n
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -301,7 +377,7 @@ def test_with_an_exact_predictor_no_packet_is_late(delay: int, jitter: int) -> N
         assert np.abs(forces_n - exactly)[heard].max(initial=0) < 1e-4
         assert not forces_n[~heard].any()
         z = z @ A.T + torch.from_numpy(forces_n)[:, None] * B
-    assert (heard_at <= delay + jitter).all()
+    assert (heard_at <= delay + jitter + planner.stride - 1).all()
 
 
 def test_a_predictor_that_takes_late_packets_for_fresh_errs() -> None:

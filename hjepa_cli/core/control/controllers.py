@@ -24,7 +24,12 @@ from hjepa_cli.errors import UsageError
 
 
 class _Strides:
-    """Plays some steps of forces at a time; a packet starts a device anew at once."""
+    """Plays some steps of forces at a time; a packet starts a device anew at once.
+
+    Where forces can be lost, devices are told those of the next steps, too (:meth:`ahead_n`). Then
+    strides are planned before their time, and played when it comes: planning costs no more, but
+    for the strides that a packet makes void.
+    """
 
     def __init__(self, stride: int, devices: int, action_shape: tuple[int, ...]) -> None:
         self._stride = stride
@@ -33,6 +38,8 @@ class _Strides:
         self._phase = np.full(devices, stride)
         self._heard = np.zeros(devices, dtype=bool)
         self._sent = SentForces(devices, REMEMBERED_STEPS, action_shape)
+        self._later_n = torch.zeros(devices, 0, stride, *action_shape)  # strides planned already
+        self._ready = np.zeros(devices, dtype=np.int64)  # how many of them there are
 
     @torch.inference_mode()
     def act(self, delivered: Bools, packets: Tensor | None, ages: Integers | None = None) -> Floats:
@@ -40,6 +47,7 @@ class _Strides:
 
         A device that has not been heard yet gets 0 N.
         """
+        self._ready[delivered] = 0
         if packets is not None:
             packets = self._take(delivered, packets, ages)
             if not self._z.shape[1]:
@@ -52,15 +60,23 @@ class _Strides:
             self._sent.note(played)
         return played
 
+    @torch.inference_mode()
     def ahead_n(self) -> Floats:
-        """Return the forces [n, stride, *A] of the last step and of what its stride has left.
-
-        Behind its end the last one is repeated.
-        """
-        steps = np.maximum(self._phase - 1, 0)[:, None] + np.arange(self._stride)
-        steps = np.minimum(steps, self._stride - 1)
-        forces_n = self._forces_n.numpy()[np.arange(len(steps))[:, None], steps]
-        return np.asarray(forces_n, dtype=np.float64)
+        """Return the forces [n, L, *A] of the last step and of the next ones if no packet comes."""
+        further = -(-(AHEAD_STEPS - 1) // self._stride)
+        if not self._later_n.shape[1]:
+            self._later_n = self._forces_n.new_zeros(
+                len(self._phase), further, *self._forces_n.shape[1:]
+            )
+        for number in range(further):
+            rows = np.flatnonzero(self._heard & (self._ready == number))
+            if len(rows):
+                planned_n = self._plan_later(rows, number).float().cpu()
+                self._later_n[torch.from_numpy(rows), number] = planned_n
+                self._ready[rows] += 1
+        strides_n = torch.cat([self._forces_n[:, None], self._later_n], 1).flatten(1, 2).numpy()
+        steps = np.maximum(self._phase - 1, 0)[:, None] + np.arange(AHEAD_STEPS)
+        return np.asarray(strides_n[np.arange(len(steps))[:, None], steps], dtype=np.float64)
 
     @torch.inference_mode()
     def planned_n(self) -> Floats:
@@ -78,6 +94,13 @@ class _Strides:
         """Return forces_n [due.sum(), stride, *A] from the embeddings of those who are due."""
         raise NotImplementedError
 
+    def _plan_later(self, rows: Integers, number: int) -> Tensor:
+        """Return forces_n [m, stride, *A] of the stride ``number`` + 1 after the present one."""
+        raise NotImplementedError
+
+    def _go_on(self, rows: Tensor) -> None:
+        """Let the stride that comes next, and was planned already, be the present one."""
+
     @property
     def _over(self) -> Bools:
         return np.asarray(self._heard & (self._phase == self._stride))
@@ -85,7 +108,15 @@ class _Strides:
     def _play(self, due: Bools) -> Floats:
         """Plan for those who are due, and return everybody's force of this step."""
         if due.any():
-            self._forces_n[torch.from_numpy(due)] = self._plan(due).float().cpu()
+            planned = due & (self._ready > 0)
+            if planned.any():
+                rows = torch.from_numpy(np.flatnonzero(planned))
+                self._forces_n[rows] = self._later_n[rows, 0]
+                self._later_n[rows, :-1] = self._later_n[rows, 1:]
+                self._ready[planned] -= 1
+                self._go_on(rows)
+            if (new := due & ~planned).any():
+                self._forces_n[torch.from_numpy(new)] = self._plan(new).float().cpu()
             self._phase[due] = 0
         at = np.minimum(self._phase, self._stride - 1)  # 0 N of those not heard yet
         return np.asarray(self._forces_n.numpy()[np.arange(len(due)), at], dtype=np.float64)
@@ -96,6 +127,7 @@ class StrideController(_Strides):
 
     Attributes:
         taken: whose stride started anew at a packet in the last step [n].
+        stride_steps: what a stride takes; late packets are best taken whole strides old.
     """
 
     def __init__(
@@ -108,6 +140,8 @@ class StrideController(_Strides):
     ) -> None:
         super().__init__(planner.stride, devices, action_shape)
         self._planner, self._starts = planner, self._z
+        self.stride_steps = planner.stride
+        self._later_z = torch.zeros(devices, 0, 0)  # where the strides planned already lead to
         self.check = check(devices) if check else None
         self.taken = np.zeros(devices, dtype=bool)
 
@@ -142,6 +176,20 @@ class StrideController(_Strides):
         self._starts[rows] = self._z[rows]
         forces_n, self._z[rows] = self._planner.plan(self._z[rows])
         return forces_n
+
+    def _plan_later(self, rows: Integers, number: int) -> Tensor:
+        if not self._later_z.shape[1]:
+            self._later_z = self._z.new_zeros(
+                len(self._z), self._later_n.shape[1], self._z.shape[1]
+            )
+        at = torch.from_numpy(rows)
+        before = self._later_z[at, number - 1] if number else self._z[at]
+        forces_n, self._later_z[at, number] = self._planner.plan(before)
+        return forces_n
+
+    def _go_on(self, rows: Tensor) -> None:
+        self._starts[rows], self._z[rows] = self._z[rows], self._later_z[rows, 0]
+        self._later_z[rows, :-1] = self._later_z[rows, 1:]
 
     @property
     def reached(self) -> tuple[Bools, Tensor]:
@@ -249,6 +297,20 @@ class ReflexController(_Strides):
         rows, ages = torch.from_numpy(due), torch.from_numpy(self._ages[due])
         return self._reaction.plan(self._z[rows], ages, self._sent_n[rows])
 
+    def _plan_later(self, rows: Integers, number: int) -> Tensor:
+        """Plan as if all that is planned before had been sent."""
+        at, first = torch.from_numpy(rows), self._ages[rows] - self._phase[rows]
+        sent_n, before_n = (
+            self._sent_n[at],
+            [self._forces_n[at], *self._later_n[at, :number].unbind(1)],
+        )
+        steps = torch.from_numpy(first)[:, None] + torch.arange((number + 1) * self._stride)
+        known = steps < sent_n.shape[1]
+        of, _ = torch.where(known)
+        sent_n[of, steps[known]] = torch.cat(before_n, 1)[known].to(sent_n.dtype)
+        ages = torch.from_numpy(first + (number + 1) * self._stride)
+        return self._reaction.plan(self._z[at], ages, sent_n)
+
 
 class LastForce:
     """Acts on each packet, then keeps that force, lets it fade, or applies none.
@@ -310,6 +372,27 @@ class LastForce:
         return np.clip(self._played_n[:, None] * kept, -self._limit_n, self._limit_n)
 
 
+def told_ahead(
+    played_n: Floats,
+    states: Floats,
+    answer: Callable[[Floats], Floats],
+    moved: Callable[[Floats, Floats], Floats],
+) -> Floats:
+    """Return the forces [n, L, *A] of a step and of the next ones, from the states [n, S] after it.
+
+    Args:
+        played_n: forces of the step [n, *A].
+        states: where devices are believed to be then.
+        answer: states → forces_n.
+        moved: states and the forces of a step → states after it.
+    """
+    forces_n = [played_n]
+    for _ in range(AHEAD_STEPS - 1):
+        forces_n.append(answer(states))
+        states = moved(states, forces_n[-1])
+    return np.stack(forces_n, axis=1)
+
+
 class Oracle:
     """Plays the true state at each packet and exact equations in between: a predictor's ceiling.
 
@@ -337,6 +420,7 @@ class Oracle:
     ) -> None:
         self._actor, self._advance, self._limit_n = actor, advance, force_limit_n
         self._states = np.zeros((devices, states))
+        self._played_n = np.zeros((devices, *action_shape))
         self._sent = SentForces(devices, REMEMBERED_STEPS, action_shape)
 
     def act(self, delivered: Bools, packets: Floats | None, ages: Integers | None = None) -> Floats:
@@ -345,15 +429,22 @@ class Oracle:
             if ages is not None:
                 packets = self._follow(packets, np.flatnonzero(delivered), ages)
             self._states[delivered] = packets
-        forces_n = self.planned_n()
-        self._states = self._moved(self._states, forces_n)
+        self._played_n = self.planned_n()
+        self._states = self._moved(self._states, self._played_n)
         if ages is not None:
-            self._sent.note(forces_n)
-        return forces_n
+            self._sent.note(self._played_n)
+        return self._played_n
 
     def planned_n(self) -> Floats:
         """Return the forces [n, *A] of the coming step if no packet comes."""
-        return np.clip(self._actor(self._states), -self._limit_n, self._limit_n)
+        return self._answer(self._states)
+
+    def ahead_n(self) -> Floats:
+        """Return the forces [n, L, *A] of the last step and of the next ones if no packet comes."""
+        return told_ahead(self._played_n, self._states, self._answer, self._moved)
+
+    def _answer(self, states: Floats) -> Floats:
+        return np.clip(self._actor(states), -self._limit_n, self._limit_n)
 
     def _follow(self, states: Floats, devices: Integers, ages: Integers) -> Floats:
         """Move late packets on to the present under the forces that were sent meanwhile."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.bounds import STATE_LIMIT
+from hjepa_cli.core.control.controllers import told_ahead
 from hjepa_cli.core.control.embedded_split import embed_split
 from hjepa_cli.core.control.link import REMEMBERED_STEPS
 from hjepa_cli.core.control.loop import noise_per_step
@@ -48,8 +49,11 @@ class LinearGaussian:
 
     def predict(self, mean: Floats, spread: Floats, actions: Floats) -> tuple[Floats, Floats]:
         """Go a step on with means [n, S] and covariances [n, S, S] under actions [n, F]."""
-        moved = mean @ self.a.T + actions @ self.b.T + self.c
-        return moved, self.a @ spread @ self.a.T + self.process
+        return self.moved(mean, actions), self.a @ spread @ self.a.T + self.process
+
+    def moved(self, mean: Floats, actions: Floats) -> Floats:
+        """Return the means [n, S] of :meth:`predict`."""
+        return mean @ self.a.T + actions @ self.b.T + self.c
 
     def correct(self, mean: Floats, spread: Floats, seen: Floats) -> tuple[Floats, Floats]:
         """Take in measurements y [n, S]."""
@@ -82,6 +86,7 @@ class KalmanController:
         self._filter, self._read, self._teacher = filter_, read, teacher
         self._limit_n = force_limit_n
         self._mean = np.zeros((devices, len(filter_.c)))
+        self._played_n = np.zeros(devices)
         self._spread = np.tile(filter_.start, (devices, 1, 1))
         # What it believed in its last steps, and did: a late packet corrects the past.
         self._past: deque[tuple[Floats, Floats, Floats]] = deque(maxlen=REMEMBERED_STEPS)
@@ -94,8 +99,8 @@ class KalmanController:
                 self._correct(self._mean, self._spread, delivered, seen)
             else:
                 self._correct_past(np.flatnonzero(delivered), seen, ages)
-        forces_n = self.planned_n()
-        actions = forces_n.reshape(len(forces_n), -1) / self._limit_n
+        self._played_n = forces_n = self.planned_n()
+        actions = self._actions(forces_n)
         if ages is not None:
             self._past.append((self._mean, self._spread, actions))
         self._mean, self._spread = self._predict(self._mean, self._spread, actions)
@@ -128,7 +133,22 @@ class KalmanController:
 
     def planned_n(self) -> Floats:
         """Return the forces [n, *A] of the coming step if no packet comes."""
-        return np.clip(self._teacher(self._mean), -self._limit_n, self._limit_n)
+        return self._answer(self._mean)
+
+    def ahead_n(self) -> Floats:
+        """Return the forces [n, L, *A] of the last step and of the next ones if no packet comes."""
+
+        def moved(mean: Floats, forces_n: Floats) -> Floats:
+            mean = self._filter.moved(mean, self._actions(forces_n))
+            return np.clip(mean, -STATE_LIMIT, STATE_LIMIT)
+
+        return told_ahead(self._played_n, self._mean, self._answer, moved)
+
+    def _answer(self, mean: Floats) -> Floats:
+        return np.clip(self._teacher(mean), -self._limit_n, self._limit_n)
+
+    def _actions(self, forces_n: Floats) -> Floats:
+        return np.asarray(forces_n.reshape(len(forces_n), -1) / self._limit_n)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

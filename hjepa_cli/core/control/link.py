@@ -4,6 +4,7 @@ What it loses on the way up is the schedule's, :mod:`hjepa_cli.core.control.loop
 from a packet's capture to the step whose force answers it, so the way back is in it.
 """
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -15,8 +16,21 @@ from hjepa_cli.config.schema import IDEAL_LINK, ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 
 AHEAD_STEPS = 16  # forces in a datagram at most: its step's, and those of the next ones
+UNTOLD = 1 / 32  # share of devices that may play a force that was planned before the last packet
 REMEMBERED_STEPS = 512  # in which controllers know what they sent: no packet may be later
 STEP_BITS = FORCE_BITS = 16  # step numbers start again after 65,536
+
+
+def lead_steps(downlink_loss: float) -> int:
+    """Return how many steps before its own a force is decided, where a share of datagrams is lost.
+
+    So many that at most one device in 32 has not been told by then, and at most half a datagram:
+    without this a device that missed the answer to a packet plays what was planned before it.
+    """
+    if downlink_loss <= 0:
+        return 0
+    tellings = math.ceil(math.log(UNTOLD) / math.log(downlink_loss))
+    return min(tellings, AHEAD_STEPS // 2) - 1
 
 
 def confirmation_bits(protocol: ProtocolSettings, forces: int) -> int:

@@ -29,7 +29,7 @@ from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels
 from hjepa_cli.core.control.bounds import STATE_LIMIT
-from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight
+from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight, lead_steps
 from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.frames import LONGEST, frames_seen
 from hjepa_cli.core.plants.system import System
@@ -145,11 +145,13 @@ class LinkDraws:
         delay_steps: what every packet takes to arrive.
         extra_steps: what it takes besides [steps, N].
         lost: whether the datagram with a step's force is lost [steps, N].
+        lead_steps: how long before its step a force is decided.
     """
 
     delay_steps: int = 0
     extra_steps: NDArray[np.int16] | None = None
     lost: Bools | None = None
+    lead_steps: int = 0
 
     @classmethod
     def make(cls, protocol: ProtocolSettings, devices: int, seed: int) -> "LinkDraws":
@@ -165,22 +167,18 @@ class LinkDraws:
             protocol.delay_steps,
             np.stack(extra, axis=1) if extra else None,
             np.stack(lost, axis=1) < protocol.downlink_loss if lost else None,
+            lead_steps(protocol.downlink_loss),
         )
 
     def part(self, devices: slice | Integers) -> "LinkDraws":
         """Take the draws of some of the devices."""
         extra, lost = (None if of is None else of[:, devices] for of in self._drawn)
-        return LinkDraws(self.delay_steps, extra, lost)
+        return dataclasses.replace(self, extra_steps=extra, lost=lost)
 
     def tiled(self, points: int) -> "LinkDraws":
         """Repeat the draws of the devices for so many curve points."""
         extra, lost = (None if of is None else np.tile(of, (1, points)) for of in self._drawn)
-        return LinkDraws(self.delay_steps, extra, lost)
-
-    @property
-    def jitter_steps(self) -> int:
-        """Return the most that any packet takes besides."""
-        return 0 if self.extra_steps is None else int(self.extra_steps.max(initial=0))
+        return dataclasses.replace(self, extra_steps=extra, lost=lost)
 
     @property
     def _drawn(self) -> tuple[Any, Any]:
@@ -195,6 +193,13 @@ def takes_ages(controller: Controller) -> bool:
 class Link:
     """Carries the packets of n devices to a controller, and its forces to them.
 
+    Where forces are lost, a controller that knows ages runs some steps ahead of the devices: each
+    force is decided so long before its step that most likely one of the datagrams until then tells
+    of it. To that controller all packets are so much later.
+
+    A controller with ``stride_steps`` gets a late packet when it is whole strides old: to move it
+    on by the few steps that are left costs more than to wait for so long.
+
     Args:
         draws: of these devices.
         controller: drives them.
@@ -205,13 +210,22 @@ class Link:
     """
 
     def __init__(self, draws: LinkDraws, controller: Controller, delay_steps: int = 0) -> None:
-        delay_steps += draws.delay_steps
-        self._late = delay_steps > 0 or draws.extra_steps is not None
-        self._in_flight = InFlight(delay_steps, draws.extra_steps)
+        delay_steps, extra_steps = delay_steps + draws.delay_steps, draws.extra_steps
         self._downlink = None if draws.lost is None else Downlink(draws.lost)
         self._controller = controller
-        self._told = self._late and takes_ages(controller)
-        if self._told and (latest := delay_steps + draws.jitter_steps) > REMEMBERED_STEPS:
+        self._lead_steps = draws.lead_steps if takes_ages(controller) else 0
+        self._decided: deque[Floats] = deque(maxlen=self._lead_steps + 1)  # until the next step's
+        stride = getattr(controller, "stride_steps", 1)
+        if extra_steps is None:
+            delay_steps += -(delay_steps + self._lead_steps) % stride
+        else:
+            extra_steps = extra_steps + -(delay_steps + self._lead_steps + extra_steps) % stride
+        late = delay_steps > 0 or extra_steps is not None
+        self._in_flight = InFlight(delay_steps, extra_steps) if late else None
+        self._told = (late or self._lead_steps > 0) and takes_ages(controller)
+        latest = delay_steps + self._lead_steps
+        latest += 0 if extra_steps is None else int(extra_steps.max(initial=0))
+        if self._told and latest > REMEMBERED_STEPS:
             raise UsageError(
                 f"packets may come {latest} steps late; a controller remembers what it sent in the "
                 f"last {REMEMBERED_STEPS}",
@@ -220,15 +234,28 @@ class Link:
 
     def forces_n(self, sent: Bools, packets: Any) -> Floats:
         """Send the packets of one step; return the forces [n, *A] that devices play in it."""
-        ages = None
-        if self._late:
+        if self._in_flight:
             sent, packets, ages = self._in_flight.pass_on(sent, packets)
+        else:
+            ages = np.zeros(int(sent.sum()), np.int64)
         act: Any = self._controller.act
-        forces_n: Floats = act(sent, packets, ages) if self._told else act(sent, packets)
+        told = (ages + self._lead_steps,) if self._told else ()
+        forces_n: Floats = act(sent, packets, *told)
         if self._downlink is None:
             return forces_n
-        ahead_n = getattr(self._controller, "ahead_n", lambda: forces_n[:, None])
-        return self._downlink.play(ahead_n())
+        if not self._decided:
+            self._decided.extend([np.zeros_like(forces_n)] * self._lead_steps)
+        self._decided.append(forces_n)
+        ahead_n = getattr(self._controller, "ahead_n", lambda: forces_n[:, None])()
+        decided_n = np.stack(self._decided, axis=1)
+        return self._downlink.play(np.concatenate([decided_n, ahead_n[:, 1:]], axis=1))
+
+    def planned_n(self) -> Floats:
+        """Return the forces [n, *A] of the coming step if no packet comes."""
+        if self._lead_steps and self._decided:
+            return self._decided[1]
+        planned: Any = self._controller
+        return planned.planned_n()  # type: ignore[no-any-return]
 
 
 def device_draws(

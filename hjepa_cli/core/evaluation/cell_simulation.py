@@ -88,7 +88,7 @@ def simulate_cell(
         if access.levels and k:
             uplink.weigh(controller.apart)
         if uplink.listens and (checking := uplink.checking()).any():
-            planned_n = controller.planned_n()
+            planned_n = link.planned_n()
             uplink.hear(checking, _innovation(plants, method, checking, planned_n))
         arrived = uplink.grant()
         packets += arrived if k >= first_counted else 0

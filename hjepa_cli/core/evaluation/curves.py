@@ -19,6 +19,7 @@ import msgspec
 
 from hjepa_cli.config.checks import LATE
 from hjepa_cli.config.schema import CollectSettings, Settings
+from hjepa_cli.core.control.link import AHEAD_STEPS, lead_steps
 from hjepa_cli.core.control.loop import LOOP_VERSION
 from hjepa_cli.core.plants.conditions import altered
 from hjepa_cli.core.plants.named import definition
@@ -100,6 +101,10 @@ class Digest:
             fitted.append(_starts(values["collect"]))
         if wrong := _belief_steps(settings):
             fitted.append(wrong)
+        if (link := settings.protocol).downlink_loss:  # how far ahead forces are planned and decided
+            measured["ahead_steps"] = [AHEAD_STEPS, lead_steps(link.downlink_loss)]
+        if link.delay_steps or link.jitter_steps:
+            measured["late"] = "taken whole strides old"
         payload = settings.protocol.payload
         if CODECS[payload].fitted or settings.protocol.false_alarm:
             measured["fitted"] = fitted
