@@ -65,18 +65,20 @@ def test_the_main_table_is_what_the_commands_print(shell):
                 cell = table[found["method"]]["devices, 5G NR"]
                 assert numbers(cell) == [found["devices"], *found["devices_ci95"]], found
     gains = {gain["over"]: gain["ratio"] for gain in document["gains"] if gain["method"] == "hjepa"}
-    assert f"on time\n> it only ties that network ({100 * gains['oracle']:.0f} %)" in CLAIM
+    assert f"on time it only ties with those ({100 * gains['oracle']:.0f} %)" in CLAIM
     low, high = next(g["ratio_ci95"] for g in document["gains"] if g["over"] == "chunk")
     assert low < 1 < high
 
 
 def test_the_claim_is_of_the_delays_that_were_measured():
-    """Its rival is the network that sees the packet, its age and the forces sent since."""
-    late = [row for row in files.read_json(ROOT / "docs/results/delay.json")["rows"]
-            if row["delay_ms"] == 40]  # fmt: skip
-    best = {row["method"]: row["devices"] for row in late}
-    assert "40 ms late" in CLAIM and f"{best['hjepa'] / best['chunk-forces']:.1f} times" in CLAIM
-    assert f"{100 * best['hjepa'] / best['oracle']:.0f} % as many as with a perfect model" in CLAIM
+    """Its rivals predict nothing: a network, and forces that fade, each made for one gap."""
+    best: dict[str, int] = {}
+    for row in files.read_json(ROOT / "docs/results/delay.json")["rows"]:
+        if row["delay_ms"] == 40:
+            best[row["method"]] = max(row["devices"], best.get(row["method"], 0))
+    own, reflex = best["hjepa"], max(best["chunk-forces"], best["hold-decay-linear"])
+    assert "40 ms late" in CLAIM and f"{own / reflex:.1f} times" in CLAIM
+    assert f"{100 * own / best['oracle']:.0f} % as many as with a perfect model" in CLAIM
 
 
 def test_as_many_pendulums_are_dropped_as_the_page_says():

@@ -101,7 +101,7 @@ class Digest:
             fitted.append(_starts(values["collect"]))
         if wrong := _belief_steps(settings):
             fitted.append(wrong)
-        if (link := settings.protocol).downlink_loss:  # how far ahead forces are planned and decided
+        if (link := settings.protocol).downlink_loss:  # how long ahead forces are planned, decided
             measured["ahead_steps"] = [AHEAD_STEPS, lead_steps(link.downlink_loss)]
         if link.delay_steps or link.jitter_steps:
             measured["late"] = "taken whole strides old"
