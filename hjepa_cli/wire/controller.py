@@ -398,6 +398,7 @@ class Controller:
             packet, late = session.fresh
             z[row] = protocol.decode_int8(packet.scale, packet.codes)
             age = packet.capture_age + late + session.delay_steps()
+            age += -age % self.bundle.stride  # P^H alone moves it on; until then the old plan holds
             ages.append(min(age, REMEMBERED_STEPS - WINDOW_STEPS))
             if packet.source != protocol.PLANNED and packet.force_age <= packet.step:
                 session.remember(packet.step - packet.force_age, packet.forces_n[None])
