@@ -76,13 +76,14 @@ class Signs(nn.Module):
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return the even part [..., n_even] and the odd one [..., n_odd] of x [..., n]."""
-        x = x if self._sorted else x[..., self.order]
+        # Of these two ways to take columns the usual one, x[..., order], is five times as slow.
+        x = x if self._sorted else x.index_select(-1, self.order)
         return x[..., : self.even], x[..., self.even :]
 
     def join(self, even: Tensor, odd: Tensor) -> Tensor:
         """Undo :meth:`split`."""
         x = torch.cat([even, odd], dim=-1)
-        return x if self._sorted else x[..., torch.argsort(self.order)]
+        return x if self._sorted else x.index_select(-1, torch.argsort(self.order))
 
 
 class Twins(nn.Module):
