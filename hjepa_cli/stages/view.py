@@ -5,6 +5,7 @@ pole, the pole that a linear probe reads from the controller's current embedding
 SNR and the age of the last packet. It shows a handful of devices; numbers come from ``eval``.
 """
 
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,10 @@ PROBE_TRAJECTORIES, PROBE_EVERY = 40, 4  # 1,600 inputs: rendered and encoded in
 
 
 class Believer:
-    """A linear probe reads, at every step, what a controller of n devices believes."""
+    """A linear probe reads, at every step, what a controller of n devices believes.
+
+    ``act`` is :meth:`watch`, and takes ages where the controller does.
+    """
 
     def __init__(self, controller: Controller, probe: torch.Tensor) -> None:
         self._controller: Any = controller
@@ -63,8 +67,9 @@ class Believer:
         self._heard = False
         self.believed: list[Floats] = []
         self.flagged: list[Bools] = []
+        self.act = functools.wraps(controller.act)(lambda *of: self.watch(*of))
 
-    def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
+    def watch(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]."""
         told = (ages,) if takes_ages(self._controller) else ()
         forces_n: Floats = self._controller.act(delivered, packets, *told)

@@ -10,6 +10,7 @@ from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.disagreement import TwoLevels, calibrate_levels
 from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.control.error_growth import conformal_growth
+from hjepa_cli.core.control.loop import Link, LinkDraws
 from hjepa_cli.core.control.planners import OnePredictor
 from hjepa_cli.core.radio.uplink import Access, Uplink
 
@@ -65,6 +66,18 @@ def test_before_a_late_packet_comes_levels_are_not_apart():
     for _ in range(2):
         both.act(nobody, None, np.zeros(0, int))
     assert both.apart * 40 == pytest.approx([1.5, 0.0])  # who is not heard yet has no levels
+
+
+def test_late_packets_and_lost_forces_are_those_without_the_other_level():
+    lost = np.random.default_rng(0).random((40, 2)) < 0.5
+
+    def played(wrap):
+        link = Link(LinkDraws(2, None, lost, 3), wrap(StrideController(Late(), 2)))
+        sent = lambda k: np.array([k % 9 == 0, k % 7 == 0])  # noqa: E731
+        packets = lambda k: torch.full((int(sent(k).sum()), 1), float(k))  # noqa: E731
+        return [link.forces_n(sent(k), packets(k) if sent(k).any() else None) for k in range(40)]
+
+    assert np.array_equal(played(levels_of), played(lambda controller: controller))
 
 
 def test_a_packet_that_is_kept_back_is_no_start_of_either_level():

@@ -80,6 +80,11 @@ class TwoLevels:
         return self._controller.ahead_n()
 
     @property
+    def stride_steps(self) -> int:
+        """Return what the controller's strides take."""
+        return self._controller.stride_steps
+
+    @property
     def apart(self) -> Floats:
         """Return how far the levels were apart when each device's last stride ended: d [n]."""
         return self._apart

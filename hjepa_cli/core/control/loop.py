@@ -52,7 +52,8 @@ class Controller(Protocol):
         that may be late how many steps ago each packet was sensed. Another takes them for fresh.
 
         One that has ``ahead_n()``, too, tells devices the forces [n, L, *A] of this step and of the
-        next ones without a packet; of others a device holds the last force that reaches it.
+        next ones without a packet; of others a device holds the last force that reaches it. One
+        that has ``stride_steps`` is given late packets whole strides old.
         """
         ...
 
