@@ -17,7 +17,7 @@ NAME_PT, NOTE_PT = 7, 6
 LINE_HEIGHT = 1.2
 AWAY = 0.05  # of a panel's width, from its edge to the names
 SAME = 0.02  # of a panel's height: lines no further apart anywhere are drawn on each other
-LIES_ON = "≈ lies on the line that is named above"
+LIES_ON = "≈ overlaps the line of the label above it"
 DIGIT_PT = 0.7  # of a letter's size, about
 APART_PT = 5  # between the numbers at two ticks
 

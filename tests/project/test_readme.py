@@ -65,20 +65,22 @@ def test_the_main_table_is_what_the_commands_print(shell):
                 cell = table[found["method"]]["devices, 5G NR"]
                 assert numbers(cell) == [found["devices"], *found["devices_ci95"]], found
     gains = {gain["over"]: gain["ratio"] for gain in document["gains"] if gain["method"] == "hjepa"}
-    assert f"on time, as many as with the former and {100 * gains['oracle']:.0f} % of" in CLAIM
+    assert f"on time, as many as without prediction, {100 * gains['oracle']:.0f} % of" in CLAIM
     low, high = next(g["ratio_ci95"] for g in document["gains"] if g["over"] == "chunk")
     assert low < 1 < high
 
 
 def test_the_claim_is_of_the_delays_that_were_measured():
     """Its rivals predict nothing: a network, and forces that fade, each made for one gap."""
-    best: dict[str, int] = {}
+    best: dict[str, list[int]] = {}  # devices and the ends of their interval
     for row in files.read_json(ROOT / "docs/results/delay.json")["rows"]:
         if row["delay_ms"] == 40:
-            best[row["method"]] = max(row["devices"], best.get(row["method"], 0))
+            found = [row["devices"], *row["devices_ci95"]]
+            best[row["method"]] = max(found, best.get(row["method"], [0]))
     own, reflex = best["hjepa"], max(best["chunk-forces"], best["hold-decay-linear"])
-    assert "40 ms late" in CLAIM and f"{own / reflex:.1f} times" in CLAIM
-    assert f"{100 * own / best['oracle']:.0f} % as many as with a perfect model" in CLAIM
+    ratio, least = own[0] / reflex[0], own[1] / reflex[2]
+    assert "40 ms late" in CLAIM and f"{ratio:.1f} times (at least {least:.1f})" in CLAIM
+    assert f"{100 * own[0] / best['oracle'][0]:.0f} % as many as with a\n> perfect model" in CLAIM
 
 
 def test_as_many_pendulums_are_dropped_as_the_page_says():
@@ -86,7 +88,7 @@ def test_as_many_pendulums_are_dropped_as_the_page_says():
     for model, method in ((MODEL, "hjepa"), ("desktop-reflex", "chunk")):
         kept = files.read_json(zoo.zoo_directory() / model / zoo.CURVES_FILE)["methods"]
         lost[method] = kept[method]["tolerance_gap_lost"]
-    assert "it drops no pendulum, H-JEPA at its own one in\nten" in TEXT
+    assert "`chunk` drops no pendulum, H-JEPA one in ten" in TEXT
     assert lost["chunk"] == 0 and abs(lost["hjepa"] - 0.1) < 0.025
 
 
@@ -98,7 +100,7 @@ def test_limits_of_pictures_are_those_that_were_measured():
         row["condition"]: row["points"][1]["relative"] for row in stress["methods"]["hjepa"]["rows"]
     }
     mild = ("light=0.7", "light=1.3", "gamma=0.8", "gamma=1.25", "blur=1.5", "jpeg=75", "noise=8")
-    (said,) = re.findall(r"cost at most (\d+) % at gaps of 80\s+ms", TEXT)
+    (said,) = re.findall(r"cost at most (\d+) % of the score at gaps of 80\s+ms", TEXT)
     assert round(100 * (1 - min(kept[name] for name in mild))) == int(said)
     assert abs(kept["jitter=0.1"] - 0.5) < 0.05  # "halves the score"
     assert max(kept["rotation=2"], kept["light=0.7+noise=8"]) < kept["jitter=0.1"]
