@@ -29,6 +29,7 @@ from study import as_toml, hjepa
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.drivers import build_driver, methods_of
+from hjepa_cli.core.control.link import LINK_VERSION
 from hjepa_cli.core.control.loop import LOOP_VERSION, Draws, gap_schedule, simulate
 from hjepa_cli.core.networks.model import LEVELS, Model
 from hjepa_cli.core.plants.conditions import actual_plant
@@ -122,7 +123,9 @@ def counted(
                 "tolerance_gap_ci95": ends,
                 "devices": devices(options, row, longest),
                 "devices_ci95": [devices(options, row, end) for end in ends],
-                "reason": None,
+                "devices_over": {},
+                "at_least": longest == entry["gap_curve"][-1]["d"],
+                "reason": None if longest else "no gap around it is acceptable",
             }
     return rows
 
@@ -212,7 +215,8 @@ def calls(options: argparse.Namespace, delay: int, name: str) -> dict[str, dict[
 def point(options: argparse.Namespace, stage: str, *of: Any) -> Path:
     """The directory of a point, named after all that it depends on."""
     config = options.config.read_text() if options.config else ""
-    described = json.dumps([LOOP_VERSION, options.preset, options.seed, config, *map(str, of)])
+    versions = [LOOP_VERSION, LINK_VERSION]
+    described = json.dumps([*versions, options.preset, options.seed, config, *map(str, of)])
     return options.out / f"{stage}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
 
 

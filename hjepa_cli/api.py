@@ -98,7 +98,8 @@ def drive(
 
     Args:
         method: as on the command line; those on embeddings need ``model``. Packets of ``hold+9``
-            come 9 steps later than the settings' ``protocol.delay_steps`` say.
+            come 9 steps later than the settings' ``protocol.delay_steps`` say; ``hjepa`` takes
+            late ones when they are whole strides old.
         model: of :func:`load_model`, of the same plant. It brings along the law that it learned and
             the camera that it was trained with.
         gap_steps: a packet every so many steps; or

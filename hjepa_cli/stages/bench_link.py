@@ -152,15 +152,18 @@ def run(
             link, lost = recorded.draws(steps, devices, 1e3 * kind.step_s)
             link = dataclasses.replace(link, lost=draws.link.lost)
             sent &= ~lost
-            draws = dataclasses.replace(draws, link=link)
+        # The wire answers at once, and sends each force several times instead of deciding it early.
+        draws = dataclasses.replace(draws, link=dataclasses.replace(link, lead_steps=0))
         runtime = Runtime(bundle, backend)
         runtime.warm_up("encoder", "actor")
         moved = actual_plant(settings.plant, settings.conditions)
         camera = actual_camera(seen_as_trained(settings, bundle.manifest["camera"]))
+        late = latest_steps(link)
+        late += -late % bundle.stride  # the controller takes packets up whole strides old
         fleet = Fleet(
             *(bundle, runtime, moved, camera, draws, sent, NO_KEY, period_s),
             local=harm is not None,
-            grace_steps=latest_steps(link) + (0 if lockstep else START_STEPS),
+            grace_steps=late + (0 if lockstep else START_STEPS),
             lost=link.lost,
         )
         with screen.progress("wire", steps, "steps") as bar:

@@ -29,6 +29,7 @@ from hjepa_cli.core.control.loop import (
     LinkDraws,
     check_memory,
     gap_schedule,
+    lead_of,
     simulate,
     takes_ages,
 )
@@ -323,5 +324,11 @@ def film(
             tick=bar.advance,
             watch=lambda k, now, forces_n: states.append(now.copy()),
         )
-    in_band, flagged = kind.in_band(np.stack(states)), np.stack(believer.flagged)
-    return Film(name, np.stack(states), np.stack(believer.believed), in_band, flagged)
+    believed, flagged = np.stack(believer.believed), np.stack(believer.flagged)
+    if lead := lead_of(link.draws, believer):  # it decides on later steps, and believes in them
+        believed = np.concatenate([np.zeros_like(believed[:lead]), believed[:-lead]])
+    for k, device in np.argwhere(flagged):  # it may have waited since it came
+        flagged[k, device] = False
+        flagged[np.flatnonzero(link.delivered[: k + 1, device])[-1], device] = True
+    in_band = kind.in_band(np.stack(states))
+    return Film(name, np.stack(states), believed, in_band, flagged)

@@ -258,6 +258,30 @@ CONTROLLERS: dict[str, tuple[Callable[[int], Any], Callable[[np.ndarray], Any]]]
 }
 
 
+def test_a_filter_moves_a_packet_of_the_first_step_on_to_the_step_that_it_decides() -> None:
+    filter_, state = gaussian(), np.array([[0.01, 1.0, 0.02, -0.5]])
+    controller = KalmanController(filter_, np.asarray, TEACHER, 20.0, 1)
+    mean, _ = filter_.correct(np.zeros((1, 4)), filter_.start[None], state)
+    for _ in range(4):
+        mean = filter_.moved(mean, np.zeros((1, 1)))
+    played = controller.act(np.ones(1, bool), state, np.array([4]))
+    assert played == pytest.approx(np.clip(TEACHER(mean), -20.0, 20.0))
+
+
+def test_a_planner_that_moves_nothing_on_decides_in_each_step() -> None:
+    """It would have to, if forces were decided earlier: packets would be late."""
+
+    class Blind:
+        stride = 2
+
+        def plan(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return z[:, :1].expand(-1, 2), z
+
+    link = Link(LinkDraws(0, None, np.zeros((9, 1), bool), 3), StrideController(Blind(), 1))
+    played = [link.forces_n(np.ones(1, bool), torch.full((1, 1), float(k))) for k in range(9)]
+    assert np.concatenate(played).tolist() == list(range(9))
+
+
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_what_is_told_of_the_next_steps_is_what_is_played_without_a_packet(name: str) -> None:
     random, devices = np.random.default_rng(0), 4

@@ -593,6 +593,20 @@ def test_what_is_fitted_depends_on_wrong_beliefs_where_trajectories_do(law: dict
     assert digest.fitted == hashlib.sha256(files.canonical_json(before).encode()).hexdigest()
 
 
+def test_only_what_was_measured_late_depends_on_how_links_are_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of = curves.Digest.of
+    late = of(None, load_settings(flags={"protocol.delay_steps": 5}))
+    path, digest = tmp_path / "curves.json", of(None, load_settings())
+    curves.write(path, digest, {"oracle": entry_of(0.5), "oracle+3": entry_of(0.4)})
+    assert curves.read(path, digest).keys() == {"oracle", "oracle+3"}
+    monkeypatch.setattr(curves, "LINK_VERSION", curves.LINK_VERSION + 1)
+    assert curves.read(path, digest).keys() == {"oracle"}
+    assert of(None, load_settings()) == digest
+    assert of(None, load_settings(flags={"protocol.delay_steps": 5})) != late
+
+
 def test_late_packets_are_late_in_the_curves_too() -> None:
     settings = small()
     bench = Bench(settings.protocol, settings.seed, Simulator(settings, None))

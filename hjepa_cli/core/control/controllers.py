@@ -18,7 +18,12 @@ from torch import Tensor
 from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.familiarity import PacketCheck
-from hjepa_cli.core.control.link import AHEAD_STEPS, REMEMBERED_STEPS, SentForces
+from hjepa_cli.core.control.link import (
+    AHEAD_STEPS,
+    MOST_LEAD_STEPS,
+    REMEMBERED_STEPS,
+    SentForces,
+)
 from hjepa_cli.core.networks.planning import Planner, Reaction
 from hjepa_cli.errors import UsageError
 
@@ -37,7 +42,8 @@ class _Strides:
         self._forces_n = torch.zeros(devices, stride, *action_shape)
         self._phase = np.full(devices, stride)
         self._heard = np.zeros(devices, dtype=bool)
-        self._sent = SentForces(devices, REMEMBERED_STEPS, action_shape)
+        longest = REMEMBERED_STEPS + MOST_LEAD_STEPS + stride
+        self._sent = SentForces(devices, longest, action_shape)
         self._later_n = torch.zeros(devices, 0, stride, *action_shape)  # strides planned already
         self._ready = np.zeros(devices, dtype=np.int64)  # how many of them there are
 
@@ -128,6 +134,7 @@ class StrideController(_Strides):
     Attributes:
         taken: whose stride started anew at a packet in the last step [n].
         stride_steps: what a stride takes; late packets are best taken whole strides old.
+        moves_on: whether the planner can move late packets on: a plugin's may not.
     """
 
     def __init__(
@@ -140,7 +147,7 @@ class StrideController(_Strides):
     ) -> None:
         super().__init__(planner.stride, devices, action_shape)
         self._planner, self._starts = planner, self._z
-        self.stride_steps = planner.stride
+        self.stride_steps, self.moves_on = planner.stride, hasattr(planner, "follow")
         self._later_z = torch.zeros(devices, 0, 0)  # where the strides planned already lead to
         self.check = check(devices) if check else None
         self.taken = np.zeros(devices, dtype=bool)
@@ -159,7 +166,7 @@ class StrideController(_Strides):
         """Move late packets on to the present."""
         if ages is None or not ages.any():
             return packets
-        if not hasattr(self._planner, "follow"):  # of a plugin
+        if not self.moves_on:
             raise UsageError(
                 f"packets come late, and {type(self._planner).__name__} cannot move an embedding "
                 "on under given forces: it has no follow(z, forces_n, ages)",
@@ -421,7 +428,7 @@ class Oracle:
         self._actor, self._advance, self._limit_n = actor, advance, force_limit_n
         self._states = np.zeros((devices, states))
         self._played_n = np.zeros((devices, *action_shape))
-        self._sent = SentForces(devices, REMEMBERED_STEPS, action_shape)
+        self._sent = SentForces(devices, REMEMBERED_STEPS + MOST_LEAD_STEPS, action_shape)
 
     def act(self, delivered: Bools, packets: Floats | None, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are true states [delivered.sum(), S]."""

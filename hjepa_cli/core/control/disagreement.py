@@ -85,6 +85,11 @@ class TwoLevels:
         return self._controller.stride_steps
 
     @property
+    def moves_on(self) -> bool:
+        """Return whether the controller can move late packets on."""
+        return self._controller.moves_on
+
+    @property
     def apart(self) -> Floats:
         """Return how far the levels were apart when each device's last stride ended: d [n]."""
         return self._apart

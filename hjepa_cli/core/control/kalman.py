@@ -19,7 +19,7 @@ from hjepa_cli.core.arrays import Bools, Floats, Integers
 from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.controllers import told_ahead
 from hjepa_cli.core.control.embedded_split import embed_split
-from hjepa_cli.core.control.link import REMEMBERED_STEPS
+from hjepa_cli.core.control.link import MOST_LEAD_STEPS, REMEMBERED_STEPS
 from hjepa_cli.core.control.loop import noise_per_step
 from hjepa_cli.core.networks.health import fit_probe, read_probe
 from hjepa_cli.core.plants.system import Teacher
@@ -89,10 +89,16 @@ class KalmanController:
         self._played_n = np.zeros(devices)
         self._spread = np.tile(filter_.start, (devices, 1, 1))
         # What it believed in its last steps, and did: a late packet corrects the past.
-        self._past: deque[tuple[Floats, Floats, Floats]] = deque(maxlen=REMEMBERED_STEPS)
+        self._past: deque[tuple[Floats, Floats, Floats]] = deque(
+            maxlen=REMEMBERED_STEPS + MOST_LEAD_STEPS
+        )
 
     def act(self, delivered: Bools, packets: Any, ages: Integers | None = None) -> Floats:
         """Return the forces of one step [n, *A]; packets are those of ``read``."""
+        if ages is not None and not self._past:  # a packet of step 0 may have to be moved on
+            still = np.zeros((len(self._mean), self._filter.b.shape[1]))
+            for _ in range(MOST_LEAD_STEPS):
+                self._past.append((self._mean.copy(), self._spread.copy(), still))
         if packets is not None:
             seen = self._read(packets)
             if ages is None or not ages.any():

@@ -17,7 +17,9 @@ from hjepa_cli.core.arrays import Bools, Floats, Integers
 
 AHEAD_STEPS = 16  # forces in a datagram at most: its step's, and those of the next ones
 UNTOLD = 1 / 32  # share of devices that may play a force that was planned before the last packet
+MOST_LEAD_STEPS = AHEAD_STEPS // 2 - 1
 REMEMBERED_STEPS = 512  # in which controllers know what they sent: no packet may be later
+LINK_VERSION = 2  # raise it whenever a number measured over a link that is not ideal changes
 STEP_BITS = FORCE_BITS = 16  # step numbers start again after 65,536
 
 
@@ -30,7 +32,7 @@ def lead_steps(downlink_loss: float) -> int:
     if downlink_loss <= 0:
         return 0
     tellings = math.ceil(math.log(UNTOLD) / math.log(downlink_loss))
-    return min(tellings, AHEAD_STEPS // 2) - 1
+    return min(tellings - 1, MOST_LEAD_STEPS)
 
 
 def confirmation_bits(protocol: ProtocolSettings, forces: int) -> int:

@@ -191,6 +191,16 @@ def takes_ages(controller: Controller) -> bool:
     return "ages" in inspect.signature(controller.act).parameters
 
 
+def lead_of(draws: LinkDraws, controller: Controller) -> int:
+    """Return how long before its step a controller decides on a force.
+
+    One that knows no ages, or that says by ``moves_on`` that it cannot move a packet on, does so in
+    that step.
+    """
+    able = takes_ages(controller) and getattr(controller, "moves_on", True)
+    return draws.lead_steps if able else 0
+
+
 class Link:
     """Carries the packets of n devices to a controller, and its forces to them.
 
@@ -212,9 +222,10 @@ class Link:
 
     def __init__(self, draws: LinkDraws, controller: Controller, delay_steps: int = 0) -> None:
         delay_steps, extra_steps = delay_steps + draws.delay_steps, draws.extra_steps
+        latest = delay_steps + (0 if extra_steps is None else int(extra_steps.max(initial=0)))
         self._downlink = None if draws.lost is None else Downlink(draws.lost)
         self._controller = controller
-        self._lead_steps = draws.lead_steps if takes_ages(controller) else 0
+        self._lead_steps = lead_of(draws, controller)
         self._decided: deque[Floats] = deque(maxlen=self._lead_steps + 1)  # until the next step's
         stride = getattr(controller, "stride_steps", 1)
         if extra_steps is None:
@@ -224,8 +235,6 @@ class Link:
         late = delay_steps > 0 or extra_steps is not None
         self._in_flight = InFlight(delay_steps, extra_steps) if late else None
         self._told = (late or self._lead_steps > 0) and takes_ages(controller)
-        latest = delay_steps + self._lead_steps
-        latest += 0 if extra_steps is None else int(extra_steps.max(initial=0))
         if self._told and latest > REMEMBERED_STEPS:
             raise UsageError(
                 f"packets may come {latest} steps late; a controller remembers what it sent in the "
@@ -246,7 +255,7 @@ class Link:
             return forces_n
         if not self._decided:
             self._decided.extend([np.zeros_like(forces_n)] * self._lead_steps)
-        self._decided.append(forces_n)
+        self._decided.append(forces_n.copy())
         ahead_n = getattr(self._controller, "ahead_n", lambda: forces_n[:, None])()
         decided_n = np.stack(self._decided, axis=1)
         return self._downlink.play(np.concatenate([decided_n, ahead_n[:, 1:]], axis=1))

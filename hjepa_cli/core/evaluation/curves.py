@@ -19,7 +19,7 @@ import msgspec
 
 from hjepa_cli.config.checks import LATE
 from hjepa_cli.config.schema import CollectSettings, Settings
-from hjepa_cli.core.control.link import AHEAD_STEPS, lead_steps
+from hjepa_cli.core.control.link import LINK_VERSION
 from hjepa_cli.core.control.loop import LOOP_VERSION
 from hjepa_cli.core.plants.conditions import altered
 from hjepa_cli.core.plants.named import definition
@@ -101,10 +101,8 @@ class Digest:
             fitted.append(_starts(values["collect"]))
         if wrong := _belief_steps(settings):
             fitted.append(wrong)
-        if (link := settings.protocol).downlink_loss:  # how long ahead forces are planned, decided
-            measured["ahead_steps"] = [AHEAD_STEPS, lead_steps(link.downlink_loss)]
-        if link.delay_steps or link.jitter_steps:
-            measured["late"] = "taken whole strides old"
+        if not settings.protocol.ideal_link:
+            measured["link"] = LINK_VERSION
         payload = settings.protocol.payload
         if CODECS[payload].fitted or settings.protocol.false_alarm:
             measured["fitted"] = fitted
@@ -195,12 +193,13 @@ def find(
 
 def _depends_on(name: str, digest: Digest) -> dict[str, str]:
     """Return what a method's entry must say beside the digest of its file."""
-    method = name.partition(LATE)[0]
+    method, late, _ = name.partition(LATE)
+    link = {"link": str(LINK_VERSION)} if late else {}
     if method not in METHODS:  # of a plugin that is not in force: kept, as nobody can ask for it
         return {}
     fitted = {"fitted_to": digest.fitted} if METHODS[method].fitted else {}
     source = METHODS.source(method)
-    return fitted | ({"plugin": source.sha256} if source else {})
+    return fitted | link | ({"plugin": source.sha256} if source else {})
 
 
 def further_file(digest: Digest) -> str:

@@ -28,6 +28,7 @@ from hjepa_cli.core.networks.symmetry import (
 )
 from hjepa_cli.core.plants.frames import FRAME_SHAPE
 
+CACHED_VALUES = 2**19  # of frames prepared at a time: more do not stay in a core's own cache
 STEM_PX, STEM_CHANNELS = 4, 64
 MAP_CHANNELS = 128
 LEAST_ROWS = 2  # of the last map
@@ -219,6 +220,15 @@ class Encoder(nn.Module):
         are fitted to their background are float32, and rounded where networks compute in bfloat16,
         but their differences before that.
         """
+        few = len(frames)
+        if frames.device.type == "cpu":
+            few = max(CACHED_VALUES // math.prod(frames.shape[1:]), 1)
+        parts = [self._inputs(part) for part in torch.split(frames, few or 1)]
+        # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.
+        return torch.cat(parts).permute(0, 3, 1, 2)
+
+    def _inputs(self, frames: Tensor) -> Tensor:
+        """Return the inputs of a few frames, [N, H, W, Cκ]."""
         dtype = torch.bfloat16
         if self.photometric == "none":
             seen = [frame.to(dtype) for frame in reversed(frames.unbind(1))]
@@ -229,9 +239,8 @@ class Encoder(nn.Module):
         earlier = seen[1:]
         if self.frame_input == "difference":
             earlier = [later - before for later, before in pairwise(seen)]
-        # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.
         together = [part.to(dtype) for part in (seen[0], *earlier)]
-        return torch.cat(together, dim=-1).permute(0, 3, 1, 2)
+        return torch.cat(together, dim=-1)
 
     def fitted(self, frames: Tensor) -> list[Tensor]:
         """Return the κ pictures [N, H, W, C] of frames, fitted to their background, float32."""
