@@ -13,6 +13,7 @@ import torch
 from command_line import Shell, assert_one_line_error, open_shell
 from played import play
 
+from hjepa_cli.config.checks import check_settings
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import LastForce, Oracle, ReflexController
@@ -369,7 +370,7 @@ def test_late_packets_are_met_by_a_force_that_is_made_for_one_gap() -> None:
     found, teacher = trial.quality(decay_fit.shares_of_laws(trial, *both))
     assert found > teacher + 0.02
     with pytest.raises(UsageError, match=r"gap_steps = 13, and reflex\.search_steps = 12"):
-        settings(reflex__gap_steps=13)
+        check_settings(settings(reflex__gap_steps=13))
 
 
 def test_a_search_beats_the_law_that_it_starts_from() -> None:
