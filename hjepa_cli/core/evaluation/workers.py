@@ -10,7 +10,7 @@ import functools
 import itertools
 import multiprocessing
 import threading
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from contextlib import closing, contextmanager
 from multiprocessing.sharedctypes import Synchronized
@@ -151,7 +151,9 @@ class Workers:
 
         return start
 
-    def each(self, drive: Callable[[J], R], jobs: Iterable[J]) -> Iterator[tuple[J, R]]:
+    def each(
+        self, drive: Callable[[J], R], jobs: Iterable[J]
+    ) -> Generator[tuple[J, R], None, None]:
         """Drive as many jobs at a time as there are workers, each in a thread of its own.
 
         A job is a search that asks for units step by step: while one waits, the units of another
@@ -209,7 +211,9 @@ class ThisProcess(Workers):
         """Return the results of units; the ticks were told while they were computed."""
         return [future.result() for future in futures]
 
-    def each(self, drive: Callable[[J], R], jobs: Iterable[J]) -> Iterator[tuple[J, R]]:
+    def each(
+        self, drive: Callable[[J], R], jobs: Iterable[J]
+    ) -> Generator[tuple[J, R], None, None]:
         """Drive the jobs one after the other."""
         return ((job, drive(job)) for job in jobs)
 
