@@ -52,26 +52,35 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--checkpoint", default="desktop-h4m2l1", help="zoo name, run or file")
-    parser.add_argument("--delays", default="0,10,20,30,40,60,80", help="in control steps")
+    parser.add_argument(
+        "--delays", type=steps, default="0,10,20,30,40,60,80", help="in control steps"
+    )
     parser.add_argument("--methods", default=COMPARED)
     parser.add_argument("--snr", default="20", help="dB")
     parser.add_argument("--preset", default="default")
     parser.add_argument("--config", type=Path, help="TOML file of other settings")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--tune", default="", metavar="GAPS", help="hold-decay to these, in steps")
+    parser.add_argument(
+        "--tune", type=steps, default=[], metavar="GAPS", help="hold-decay to these, in steps"
+    )
     parser.add_argument("--dataset", type=Path, help="for --tune")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     methods, rows = options.methods.split(","), []
-    for delay in map(int, options.delays.split(",")):
+    for delay in options.delays:
         tuned = [name for name in methods if options.tune and name in TUNED]
         others = [name for name in methods if name not in tuned]
         if others:
             rows += counted(options, delay, others, options.checkpoint)
-        for gap in map(int, options.tune.split(",") if tuned else ()):
+        for gap in options.tune if tuned else ():
             rows += counted(options, delay, tuned, tune(options, delay, gap), gap)
         write(rows, options)
     print((options.out / "delay.csv").read_text())
+
+
+def steps(text: str) -> list[int]:
+    """Whole numbers, separated by commas."""
+    return [int(word) for word in text.split(",")]
 
 
 def counted(
