@@ -11,6 +11,7 @@ import argparse
 import math
 
 import numpy as np
+from lists import numbers
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.drivers import build_driver
@@ -26,8 +27,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--method", default="oracle")
     parser.add_argument("--checkpoint", help="zoo name, run directory or file")
-    parser.add_argument("--coherence", default="1,2,5,10,20", help="mean slots T, a list")
-    parser.add_argument("--gaps", default="1,2,5,10,20,40,80,160", help="1/p of the curve")
+    parser.add_argument(
+        "--coherence", type=numbers, default="1,2,5,10,20", help="mean slots T, a list"
+    )
+    parser.add_argument(
+        "--gaps", type=numbers, default="1,2,5,10,20,40,80,160", help="1/p of the curve"
+    )
     parser.add_argument("--devices", type=int, default=128)
     options = parser.parse_args()
     settings = load_settings()
@@ -43,9 +48,9 @@ def main() -> None:
     everything = every_step(protocol.total_steps, options.devices)[None]
     reference = scores(everything, build_driver("optimal", settings, None))[0]
     weights = bootstrap_weights(options.devices, protocol.bootstrap, seed)
-    gaps = np.array([float(gap) for gap in options.gaps.split(",")])
+    gaps = np.array(options.gaps)
     print(f"{options.method}, {options.devices} devices, {protocol.total_steps} steps, seed {seed}")
-    for coherence in map(float, options.coherence.split(",")):
+    for coherence in options.coherence:
         schedules = np.stack([gilbert_elliott(draws.delivery, 1 / g, coherence * g) for g in gaps])
         schedules[:, 0] = True
         found = scores(schedules, method)

@@ -13,6 +13,7 @@ import math
 import time
 
 import numpy as np
+from lists import whole_numbers
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.drivers import build_driver
@@ -28,8 +29,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--method", default="oracle")
     parser.add_argument("--checkpoint", help="zoo name, run directory or file")
-    parser.add_argument("--devices", default="50,200,800,2000")
-    parser.add_argument("--steps", default="100,200")
+    parser.add_argument("--devices", type=whole_numbers, default="50,200,800,2000")
+    parser.add_argument("--steps", type=whole_numbers, default="100,200")
     parser.add_argument("--schedulers", default="round-robin,max-aoi,innovation")
     parser.add_argument("--load", type=int, default=100, help="devices per block, about")
     options = parser.parse_args()
@@ -43,9 +44,7 @@ def main() -> None:
     method = build_driver(options.method, settings, model)
     growth = measure_growth(kind, settings.protocol, 1, method, longest=100)
     for scheduler in options.schedulers.split(","):
-        for steps, devices in itertools.product(
-            map(int, options.steps.split(",")), map(int, options.devices.split(","))
-        ):
+        for steps, devices in itertools.product(options.steps, options.devices):
             protocol = dataclasses.replace(settings.protocol, warmup_steps=0, steps=steps)
             access = Access(
                 scheduler=scheduler,

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lists import whole_numbers
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 MILLION = 1_000_000
@@ -68,10 +69,10 @@ def line(sizes: list[int], seconds: list[float]) -> tuple[float, float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", default="2000,4000,8000,16000,32000")
+    parser.add_argument("--sizes", type=whole_numbers, default="2000,4000,8000,16000,32000")
     parser.add_argument("--workers", type=int, default=0)
     options = parser.parse_args()
-    sizes = [int(size) for size in options.sizes.split(",")]
+    sizes = options.sizes
     collected = []
     for size in sizes:
         collected.append(collect(size, options.workers))

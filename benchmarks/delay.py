@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lists import whole_numbers
 from study import as_toml, hjepa
 
 from hjepa_cli.config.settings import load_settings
@@ -53,7 +54,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--checkpoint", default="desktop-h4m2l1", help="zoo name, run or file")
     parser.add_argument(
-        "--delays", type=steps, default="0,10,20,30,40,60,80", help="in control steps"
+        "--delays", type=whole_numbers, default="0,10,20,30,40,60,80", help="in control steps"
     )
     parser.add_argument("--methods", default=COMPARED)
     parser.add_argument("--snr", default="20", help="dB")
@@ -61,7 +62,11 @@ def main() -> None:
     parser.add_argument("--config", type=Path, help="TOML file of other settings")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--tune", type=steps, default=[], metavar="GAPS", help="hold-decay to these, in steps"
+        "--tune",
+        type=whole_numbers,
+        default=[],
+        metavar="GAPS",
+        help="hold-decay to these, in steps",
     )
     parser.add_argument("--dataset", type=Path, help="for --tune")
     options = parser.parse_args()
@@ -76,11 +81,6 @@ def main() -> None:
             rows += counted(options, delay, tuned, tune(options, delay, gap), gap)
         write(rows, options)
     print((options.out / "delay.csv").read_text())
-
-
-def steps(text: str) -> list[int]:
-    """Whole numbers, separated by commas."""
-    return [int(word) for word in text.split(",")]
 
 
 def counted(

@@ -14,6 +14,7 @@ import itertools
 import math
 
 import numpy as np
+from lists import numbers
 
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.drivers import build_driver
@@ -42,16 +43,16 @@ def main() -> None:
     parser.add_argument("--method", default="oracle")
     parser.add_argument("--checkpoint", help="zoo name, run directory or file")
     parser.add_argument("--plant", default="desktop")
-    parser.add_argument("--speeds", default="0,0.3,1,3,10,30", help="m/s, a list")
+    parser.add_argument("--speeds", type=numbers, default="0,0.3,1,3,10,30", help="m/s, a list")
     parser.add_argument("--fading", default="jakes", help="jakes, tdl-a … tdl-e")
     parser.add_argument("--margin-db", type=float, default=10.0)
-    parser.add_argument("--gaps", default="1,2,5,10,20,40,60,80,100,120,140,160,200")
+    parser.add_argument("--gaps", type=numbers, default="1,2,5,10,20,40,60,80,100,120,140,160,200")
     parser.add_argument("--devices", type=int, default=64)
     parser.add_argument("--phy", default="shannon")
     options = parser.parse_args()
     settings = load_settings(flags={"plant": options.plant, "radio.phy": options.phy})
     protocol, kind, radio = settings.protocol, plant(settings.plant), settings.radio
-    speeds = [float(speed) for speed in options.speeds.split(",")]
+    speeds = options.speeds
     for speed in speeds:
         check_speed(speed, radio.carrier_ghz, kind.step_s)
     model = Model.load(zoo.resolve_model(options.checkpoint)) if options.checkpoint else None
@@ -63,7 +64,7 @@ def main() -> None:
     everything = every_step(protocol.total_steps, options.devices)[None]
     reference = scores(kind, draws, everything, build_driver("optimal", settings, None))[0]
     weights = bootstrap_weights(options.devices, protocol.bootstrap, settings.seed)
-    grid = np.array([float(gap) for gap in options.gaps.split(",")])
+    grid = np.array(options.gaps)
     taps = FLAT
     if options.fading != "jakes":
         profile = options.fading.removeprefix("tdl-")

@@ -19,6 +19,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+from lists import whole_numbers
 
 STEPS, HEIGHT, WIDTH = 100, 64, 128
 BLOCK = 1000
@@ -77,8 +78,8 @@ def measure(directory: Path, frames: int) -> dict[str, float]:
 def main() -> None:
     """Print a row for each size."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--frames", default="25000,50000,100000")
-    for frames in map(int, parser.parse_args().frames.split(",")):
+    parser.add_argument("--frames", type=whole_numbers, default="25000,50000,100000")
+    for frames in parser.parse_args().frames:
         with tempfile.TemporaryDirectory() as directory:
             print(json.dumps(measure(Path(directory), frames)), flush=True)
 

@@ -12,6 +12,8 @@ import dataclasses
 import sys
 from typing import Any
 
+from lists import whole_numbers
+
 from hjepa_cli.config.schema import NrSettings, Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.evaluation.bench import Bench
@@ -37,7 +39,9 @@ SOURCES = {  # payload and method
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--symbols", default="14,4", help="PUSCH symbols, a list")
+    parser.add_argument(
+        "--symbols", type=whole_numbers, default="14,4", help="PUSCH symbols, a list"
+    )
     parser.add_argument("--snr", default="10:30")
     parser.add_argument("--plant", default="desktop")
     options = parser.parse_args()
@@ -45,7 +49,7 @@ def main() -> None:
     kind, grid_db = plant(settings.plant), parse_snr(options.snr)
     loops = {name: measured(options.plant, *source) for name, source in SOURCES.items()}
     layers = {"Shannon": Cell.of(settings, kind)}
-    for symbols in map(int, options.symbols.split(",")):
+    for symbols in options.symbols:
         radio = dataclasses.replace(settings.radio, phy="nr", snr_db=options.snr)
         cell = dataclasses.replace(settings, radio=radio, nr=NrSettings(pusch_symbols=symbols))
         layers[f"NR, {symbols} symbols"] = Cell.of(cell, kind)

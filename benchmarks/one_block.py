@@ -14,6 +14,7 @@ import dataclasses
 import math
 
 import numpy as np
+from lists import numbers, whole_numbers
 from scipy import stats
 
 from hjepa_cli.config.settings import load_settings
@@ -36,8 +37,12 @@ def main() -> None:
     parser.add_argument("--method", default="oracle")
     parser.add_argument("--checkpoint", help="zoo name, run directory or file")
     parser.add_argument("--schedulers", default=",".join(SCHEDULERS), help="a list")
-    parser.add_argument("--weights", help="V of drift-plus-penalty, a list (default: its own)")
-    parser.add_argument("--loads", default="200", help="devices on the block, a list")
+    parser.add_argument(
+        "--weights", type=numbers, help="V of drift-plus-penalty, a list (default: its own)"
+    )
+    parser.add_argument(
+        "--loads", type=whole_numbers, default="200", help="devices on the block, a list"
+    )
     parser.add_argument("--slots", type=int, help="default: the protocol's")
     parser.add_argument("--seeds", type=int, default=3)
     options = parser.parse_args()
@@ -56,12 +61,9 @@ def main() -> None:
     for scheduler in options.schedulers.split(","):
         own = [drift_plus_penalty.POWER_WEIGHT]
         varied = options.weights and scheduler == "drift-plus-penalty"
-        cases += [
-            (scheduler, weight)
-            for weight in (map(float, options.weights.split(",")) if varied else own)
-        ]
+        cases += [(scheduler, weight) for weight in (options.weights if varied else own)]
     print(f"{options.method}, one block, {protocol.total_steps} slots, {options.seeds} seeds")
-    for load in map(int, options.loads.split(",")):
+    for load in options.loads:
         references = []
         for seed in range(options.seeds):
             draws, always = (

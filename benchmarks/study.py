@@ -28,6 +28,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from lists import whole_numbers
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -54,7 +55,7 @@ SECTIONS_OF = {  # a stage's results depend on these settings, its own and those
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("study", choices=sorted(path.stem for path in STUDIES.glob("*.toml")))
-    parser.add_argument("--seeds", default="0", help="comma-separated")
+    parser.add_argument("--seeds", type=whole_numbers, default="0", help="comma-separated")
     parser.add_argument("--out", type=Path, default=Path("study"))
     parser.add_argument("--rows", help="only these rows, by name, separated by ;")
     arguments = parser.parse_args()
@@ -67,10 +68,9 @@ def main() -> None:
             names = "; ".join(row["name"] for row in rows)
             parser.error(f"no row {', '.join(sorted(unknown))}; choose from {names}")
         rows = [row for row in rows if row["name"] in wanted]
-    seeds = [int(seed) for seed in arguments.seeds.split(",")]
     arguments.out.mkdir(parents=True, exist_ok=True)
     measured: dict[str, dict[int, dict[str, Any]]] = {}
-    for seed in seeds:  # all rows of a seed before the next: comparisons are within a seed
+    for seed in arguments.seeds:  # all rows of one before the next: they are compared within it
         for row in rows:
             print(f"{row['name']}, seed {seed}", file=sys.stderr, flush=True)
             result = measure(row, seed, row.get("methods", methods), arguments.out)

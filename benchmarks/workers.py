@@ -17,18 +17,22 @@ import tempfile
 import time
 from pathlib import Path
 
+from lists import whole_numbers
+
 CHECKPOINT = "desktop-h4m2l1"
 COMMON = "bracket = 0.1\nbootstrap = 200\n"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--workers", default="1,2", help="to compare with the first")
+    parser.add_argument(
+        "--workers", type=whole_numbers, default="1,2", help="to compare with the first"
+    )
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--methods", default="hjepa,ts-jepa-4,hold,oracle")
     parser.add_argument("--repeat", type=int, default=1)
     options = parser.parse_args()
-    counts = [int(count) for count in options.workers.split(",")]
+    counts = options.workers
     commands = {
         "eval": ["eval", "--methods", options.methods, "--remeasure"],
         "scheduled": [
