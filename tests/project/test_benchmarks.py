@@ -20,15 +20,18 @@ from hjepa_cli.config.settings import load_settings
 from hjepa_cli.plugins import METHODS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SCRIPTS = sorted((REPOSITORY / "benchmarks").glob("*.py"))
+BENCHMARKS = REPOSITORY / "benchmarks"
+SCRIPTS = sorted(path for path in BENCHMARKS.glob("*.py") if "def main(" in path.read_text())
 
 
 def load(name: str) -> ModuleType:
-    """A benchmark as a module."""
-    spec = importlib.util.spec_from_file_location(name, REPOSITORY / "benchmarks" / f"{name}.py")
+    """A benchmark as a module; those that it imports lie beside it."""
+    spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        spec.loader.exec_module(module)
     return module
 
 
