@@ -1,7 +1,7 @@
 """Planners give controllers a model's predictions: one stride of forces at a time, in newton."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -53,6 +53,12 @@ def corrected(posterior: nn.Module, predicted: Tensor, packets: Tensor) -> Tenso
     return z
 
 
+def _actor(model: "Model") -> Callable[[Tensor], Tensor]:
+    """Return ``model.act`` for embeddings of its own predictors, which need not be looked at."""
+    actor: Any = model.networks["actor"]
+    return lambda z: actor.act(z).float()
+
+
 class Hierarchy:
     """Plans as H-JEPA: one coarse stride at a time, filled in by the finer levels."""
 
@@ -65,7 +71,7 @@ class Hierarchy:
         networks = self._model.networks
         with self._model.autocast():
             actions, _, z_next = plan_stride(
-                self._model.act,
+                _actor(self._model),
                 networks["high"],
                 networks["medium"],
                 networks["low"],
@@ -97,7 +103,7 @@ class OnePredictor:
     def plan(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Plan a stride, as :class:`~hjepa_cli.core.networks.planning.Planner` says."""
         with self._model.autocast():
-            actions = hold(self._model.act(z), self.stride)
+            actions = hold(_actor(self._model)(z), self.stride)
             return self._model.force_limit_n * actions, self._predictor(z, actions)
 
     def follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:

@@ -64,6 +64,7 @@ class Signs(nn.Module):
     """It splits vectors [..., n] of which a mirror changes some signs."""
 
     order: Tensor
+    back: Tensor
 
     def __init__(self, runs: Runs) -> None:
         super().__init__()
@@ -73,6 +74,7 @@ class Signs(nn.Module):
         self.even, self.odd = int(even.sum()), int((~even).sum())
         self._sorted = bool(even[: self.even].all())
         self.register_buffer("order", torch.from_numpy(order), persistent=False)
+        self.register_buffer("back", torch.from_numpy(np.argsort(order)), persistent=False)
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return the even part [..., n_even] and the odd one [..., n_odd] of x [..., n]."""
@@ -83,7 +85,7 @@ class Signs(nn.Module):
     def join(self, even: Tensor, odd: Tensor) -> Tensor:
         """Undo :meth:`split`."""
         x = torch.cat([even, odd], dim=-1)
-        return x if self._sorted else x.index_select(-1, torch.argsort(self.order))
+        return x if self._sorted else x.index_select(-1, self.back)
 
 
 class Twins(nn.Module):
@@ -116,9 +118,10 @@ class MirrorLinear(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map [..., n_in] to [..., n_out]."""
         even, odd = self.inputs.split(x)
+        # A loop of a few devices spends much of its time on the way into modules.
         return self.outputs.join(
-            even[..., :0] if self.even is None else self.even(even),
-            odd[..., :0] if self.odd is None else self.odd(odd),
+            even[..., :0] if self.even is None else F.linear(even, *self.even.parameters()),
+            odd[..., :0] if self.odd is None else F.linear(odd, *self.odd.parameters()),
         )
 
 
