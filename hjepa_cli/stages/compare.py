@@ -392,7 +392,8 @@ def _ratio(pairs: Sequence[tuple[Entry, Entry]], key: str, kind: str) -> dict[st
     """Return the geometric mean of the ratio of a tolerance, first ÷ second, with its interval."""
     values = [tuple(entry[f"tolerance_{key}"] for entry in pair) for pair in pairs]
     censored = any(entry[f"tolerance_{kind}_censored"] for pair in pairs for entry in pair)
-    if censored or not all(a and b for a, b in values):
+    nothing_suffices = {"gap_steps": 0.0, "p": 1.0}[key]
+    if censored or any(nothing_suffices in pair for pair in values):
         return None
     mean, ci95 = over_trainings([math.log(a / b) for a, b in values])
     return {"mean": math.exp(mean), "ci95": [math.exp(end) for end in ci95]}

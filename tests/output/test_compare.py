@@ -238,6 +238,22 @@ def test_bounds_have_no_ratio_and_intervals_stay_in_range(shell):
     assert document["differences"][0]["tolerance_gap_ratio"] is None
 
 
+def test_a_training_that_no_packets_suffice_has_no_ratio(shell):
+    """p* is 1 there, as of one that needs every packet, and D* is 0."""
+    evaluated(0)
+    path = evaluated(1) / "result.json"
+    document = json.loads(path.read_text())
+    document["methods"]["ts-jepa-4"] |= {
+        "tolerance_gap_steps": 0.0,
+        "tolerance_gap_ci95": [0.0, 0.0],
+        "tolerance_p": 1.0,
+        "tolerance_p_ci95": [1.0, 1.0],
+    }
+    reseal(path, document)
+    [found] = shell("compare", "--json").document["differences"]
+    assert found["tolerance_gap_ratio"] is None and found["tolerance_p_ratio"] is None
+
+
 @pytest.mark.parametrize(
     ("key", "value", "reason"),
     [
