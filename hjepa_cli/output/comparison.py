@@ -16,6 +16,7 @@ from hjepa_cli.output.looks import Looks
 
 ROW_IN, AROUND_IN, LEAST_IN = 0.17, 0.85, 2.6  # height of a row, of all else, of a figure at least
 AT, AFTER = "error at", "error after"  # begin the headings of errors
+DELIVERY = "delivery\np*"  # spans decades, as errors do
 Column = tuple[str, Callable[[Mapping[str, Any]], Sequence[Any] | None]]
 """A heading, and of an entry the value with its interval, or ``None`` where it was not measured."""
 
@@ -58,7 +59,7 @@ def trainings_figure(entries: Entries, *, step_s: float, asked: Looks = looks.PL
     figure.suptitle(asked.titled(""), fontsize=figures.RC["axes.titlesize"])
     gap = lambda of: _scaled(of, "tolerance_gap_steps", "tolerance_gap_ci95", step_s)  # noqa: E731
     least = lambda of: _scaled(of, "tolerance_p", "tolerance_p_ci95", 1e-3)  # noqa: E731
-    columns = [*error_columns(entries, step_s), ("gap D*\n(ms)", gap), ("delivery\np*", least)]
+    columns = [*error_columns(entries, step_s), ("gap D*\n(ms)", gap), (DELIVERY, least)]
     logarithmic = asked.logarithmic(usual=True)
     if exact := rows_panel(figure, entries, columns, asked, logarithmic=logarithmic):
         lettering.note(figure, f"no error: {', '.join(exact)}")
@@ -149,13 +150,15 @@ def rows_panel(
         panel.tick_params(axis="x", labelsize=6)
         panel.tick_params(axis="y", length=0)
         panel.grid(visible=True)
-        if panel in errors and logarithmic:
+        if logarithmic and (panel in errors or title == DELIVERY):
             panel.set_xscale("log")
         elif panel not in errors:
             panel.set_xlim(left=0)
     ends = [of for title in found if _is_error(title) for of in found[title].values() if of]
     if ends:
-        lowest, highest = min(low for _, low, _ in ends), max(high for _, _, high in ends)
+        # An interval down to nothing has no end on a logarithmic axis: there its mark decides.
+        lowest = min(low if low > figures.ZERO_ERROR else value / 2 for value, low, _ in ends)
+        highest = max(high for _, _, high in ends)
         for panel in errors:
             panel.set_xlim(0.7 * max(lowest, figures.ZERO_ERROR) * logarithmic, 1.4 * highest)
     panels[0].set_ylim(max(len(shown), 1) - 0.5, -0.5)

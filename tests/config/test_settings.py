@@ -91,7 +91,7 @@ def test_a_protocol_lies_between_preset_and_file(tmp_path: Path) -> None:
 def test_a_plant_comes_with_the_law_that_was_tuned_for_it(tmp_path: Path) -> None:
     """Under whatever preset, but for those that say otherwise; a file may say so too."""
     laws = tuned_laws()
-    assert set(laws) == {"desktop", "gym"}
+    assert set(laws) == {"desktop", "gym", "quadrotor"}
     for plant, law in laws.items():
         for preset in (None, "smoke", "default"):
             control = load_settings(preset, flags={"plant": plant}).control
@@ -100,7 +100,7 @@ def test_a_plant_comes_with_the_law_that_was_tuned_for_it(tmp_path: Path) -> Non
             control_law(named(plant), control)  # which refuses one that does not hold it
             ceiling_law(named(plant), control)
     assert origins()["control.gains_n"] == "tuned law of desktop"
-    for settings in (load_settings("paper"), load_settings(flags={"plant": "quadrotor"})):
+    for settings in (load_settings("paper"), load_settings("recorded")):
         assert settings.control == ControlSettings()
     config = tmp_path / "c.toml"
     config.write_text("[control]\ngains_n = []\n")
