@@ -38,7 +38,6 @@ from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.evaluation.protocol import BESIDE, Point
 from hjepa_cli.core.evaluation.simulator import (
     BLOCK_LOOPS,
-    BLOCK_PICTURES,
     Block,
     Runner,
     Simulator,
@@ -703,22 +702,6 @@ def test_blocks_cover_the_devices_and_follow_from_the_batch_alone() -> None:
     simulated(runner, "oracle", 3 * BLOCK_LOOPS * points[:1], 2, ticks.append)
     cuts_of = [(block.start, block.stop) for block in asked]
     assert cuts_of == [(0, 32), (32, 64), (0, 64), (0, 1), (1, 2)]
-
-
-def test_a_batch_with_many_pictures_has_more_blocks() -> None:
-    """Or one worker renders and encodes a packet at every step, and all others wait for it."""
-    cuts: list[list[int]] = []
-
-    def runner(blocks: Sequence[Block], tick: Tick) -> Callable[[], list[Outcome]]:
-        cuts.append([block.stop for block in blocks])
-        return list
-
-    every, rare = [Point("gap", 1.0)], [Point("gap", 1.0), Point("delivery", 320.0)]
-    for method, points in (("hold", every), ("hold+20", rare), ("hold-true", every)):
-        start_points(runner, method, points, 2 * BLOCK_PICTURES, silent)
-    start_points(runner, "hjepa", [Point("gap", 4.0)], 2 * BLOCK_PICTURES, silent)
-    halves, whole = [BLOCK_PICTURES, 2 * BLOCK_PICTURES], [2 * BLOCK_PICTURES]
-    assert cuts == [halves, halves, whole, whole]
 
 
 def test_a_block_of_some_devices_equals_those_among_all() -> None:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from hjepa_cli.config.checks import needs_model
 from hjepa_cli.config.schema import ProtocolSettings, Settings
 from hjepa_cli.core.control.drivers import Driver, build_driver
 from hjepa_cli.core.control.loop import Draws, Outcome, simulate
@@ -21,9 +20,6 @@ from hjepa_cli.core.plants.conditions import actual_plant
 # A loop of `hjepa` costs 1.2 times as much in blocks of 640 as in those of 1,280, and 2 times as
 # much in blocks of 260: there the networks' weights are read for few rows (benchmarks/workers.py).
 BLOCK_LOOPS = 512
-# Pictures are rendered and encoded for as long as twenty steps without a packet; a packet of a
-# loop at D = 1 takes 1.05 times as long in blocks of 32 as in those of 64, and 1.3 times in 16.
-BLOCK_PICTURES = 32  # in a mean step
 
 Tick = Callable[[int], None]
 """Told how many device-steps (one control step of one device) are done since the last call."""
@@ -129,11 +125,7 @@ def start_points(
     never by points: so its blocks cost the same, whatever each point costs. The cut follows from
     the batch alone, so that results do not depend on how many processes there are.
     """
-    count = len(points) * devices // BLOCK_LOOPS
-    if needs_model(method):
-        pictures = devices * sum(1 / point.gap for point in points)
-        count = max(count, int(pictures) // BLOCK_PICTURES)
-    count = min(max(count, 1), devices)
+    count = min(max(len(points) * devices // BLOCK_LOOPS, 1), devices)
     cuts = [devices * number // count for number in range(count + 1)]
     blocks = [
         Block(method, tuple(points), start, stop, reactive)
