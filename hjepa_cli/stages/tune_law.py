@@ -44,7 +44,8 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
         found: dict[str, Floats] = {}
         for name in ("gains_n", "ceiling_gains_n"):
             screen.say(f"searching control.{name} of plant {kind.name} on the true state")
-            found[name] = np.round(search.gains_n(learnable=name == "gains_n"), 3)
+            gains_n = search.gains_n(learnable=name == "gains_n")
+            found[name] = np.round(gains_n, 3) + 0.0  # no gain is written as -0.0
         lines = [f"# hjepa tune-law --plant {kind.name} --seed {settings.seed}"]
         lines += [f'plant = "{kind.name}"', "", "[control]"]
         lines += [f"{name} = {gains.ravel().tolist()}" for name, gains in found.items()]

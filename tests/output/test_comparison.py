@@ -106,6 +106,17 @@ def test_a_study_of_trainings_shows_tolerances_beside_errors():
     assert marks(least, shown)["hjepa"][0] == pytest.approx(given["hjepa"]["tolerance_p"])
 
 
+def test_an_interval_down_to_nothing_does_not_stretch_logarithmic_axes():
+    """Student's over few trainings often is one, of errors and of p* alike."""
+    given = entries()
+    least, _ = trainings_figure(given, step_s=1e-3).axes[0].get_xlim()
+    given["hjepa"]["nmae_every_step_ci95"] = [0.0, 0.012]
+    given["ts-jepa-1"]["tolerance_p_ci95"] = [0.0, 1.0]
+    every, *_, delivery = trainings_figure(given, step_s=1e-3).axes
+    assert 0.3 * least < every.get_xlim()[0] < least
+    assert delivery.get_xscale() == "log" and delivery.get_xlim()[0] > 1e-3
+
+
 def test_all_methods_differ_in_colour_or_marker():
     styles = [figures.method_style(name, list(METHODS)) for name in METHODS]
     assert len({(style.colour, style.marker, style.hollow) for style in styles}) == len(
