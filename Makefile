@@ -17,7 +17,7 @@ demo:
 
 test:
 	@scripts/venv test
-	.venv/bin/python -m pytest $(ARGS)
+	.venv/bin/python -m pytest -n auto --dist loadfile $(ARGS)
 
 lint:
 	@scripts/venv lint

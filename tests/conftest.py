@@ -1,8 +1,14 @@
 """Settings shared by all tests: the same examples on every machine."""
 
+import os
 import signal
 
 from hypothesis import settings
+
+# Where a process per core runs tests (make test), each computes in one thread, and so does what it
+# starts: more threads than cores wait for each other.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"
 
 # A shell's background jobs ignore Ctrl-C, those of nohup the end of the terminal, and so would
 # every process that a test starts.

@@ -74,17 +74,11 @@ class BlockLoads:
         row = self._band.row(found, name, scheduler, self._bits[name], snr_db)
         if self._settings.radio.topology != "hall":
             return row
-        row["coverage"] = share = self.coverage(snr_db)
+        row["coverage"] = share = self._coverage(name, snr_db)
         if row["devices"] == 0:
             covered = f"{share:.0%} of the hall's devices reach {snr_db:g} dB"
             row["reason"] = f"{row['reason']}; {covered}"
         return row
-
-    def coverage(self, snr_db: float) -> float:
-        """Return the share of a hall's devices, over all seeds, whose power suffices for an SNR."""
-        radio = self._settings.radio
-        shares = [hall_coverage(radio, snr_db, seed, BLOCK_DEVICES) for seed in self._seeds]
-        return sum(shares) / len(shares)
 
     def verify(self, methods: Sequence[str], grid_db: Sequence[float]) -> list[Row]:
         """Simulate a little less and a little more than each load that was found, on its draws.
@@ -116,6 +110,13 @@ class BlockLoads:
                 what, acceptable = f"{name}, {scheduler}", protocol.acceptable_score
                 verdicts.append(verdict(what, share, point, acceptable, inside=share < 1))
             return verdicts
+
+    def _coverage(self, name: str, snr_db: float) -> float:
+        """Return the share of a hall's devices, over all seeds, whose power suffices for an SNR."""
+        width_hz = self._band.cell.phy.carries(self._bits[name], snr_db).allocation_hz
+        link = self._settings.radio, snr_db
+        shares = [hall_coverage(*link, seed, BLOCK_DEVICES, width_hz) for seed in self._seeds]
+        return sum(shares) / len(shares)
 
     def _search(self, key: Key, tick: Tick) -> SupportedLoad:
         """Find the load of all seeds: the first seed's is where the search of the others begins."""

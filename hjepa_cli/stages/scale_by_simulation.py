@@ -167,9 +167,16 @@ class BySimulation:
                 for label in map(_label, lines)
             ],
         )
-        covered = {row["snr_db"]: row["coverage"] for row in result["rows"] if "coverage" in row}
+        covered: dict[float, list[float]] = {}  # by the width of packets, if these differ
+        for row in result["rows"]:
+            if "coverage" in row:
+                covered.setdefault(row["snr_db"], []).append(row["coverage"])
         if covered:
-            shares = ", ".join(f"{share:.0%} at {at:g} dB" for at, share in covered.items())
+            ends = {
+                at: dict.fromkeys(f"{end(of):.0%}" for end in (min, max))
+                for at, of in covered.items()
+            }
+            shares = ", ".join(f"{' to '.join(of)} at {at:g} dB" for at, of in ends.items())
             screen.result(f"devices of the hall whose power suffices at mean fading: {shares}")
         title, at = "simulated again, inside and outside each load", ("load", "devices/block")
         show_verdicts(result, screen, title, "method, scheduler", *at, digits=1)

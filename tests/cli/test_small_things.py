@@ -125,8 +125,8 @@ def test_a_hall_that_covers_few_says_so(hjepa) -> None:
     """Devices whose power does not suffice are why there are none."""
     Path("c.toml").write_text("[radio]\npower_dbm = -40.0\n[protocol]\nsteps = 40\n")
     hall = {"radio.topology": "hall", "radio.law": "scheduled"}
-    share = hall_coverage(load_settings(config="c.toml", flags=hall).radio, 20.0, 0, 64)
-    assert share < 0.2 < hall_coverage(load_settings(flags=hall).radio, 20.0, 0, 64)
+    share = hall_coverage(load_settings(config="c.toml", flags=hall).radio, 20.0, 0, 64, 20e6)
+    assert share < 0.2 < hall_coverage(load_settings(flags=hall).radio, 20.0, 0, 64, 20e6)
     words = ["--law", "scheduled", "--topology", "hall", "--scheduler", "round-robin"]
     words += ["--methods", "hold-true", "--preset", "smoke", "--config", "c.toml", "--snr", "20"]
     result = hjepa("scale", *words, "--json").document

@@ -147,6 +147,30 @@ def test_margins_of_a_hall_by_hand(stage, monkeypatch):
     assert seen[0][1].margin_db[0] == pytest.approx(expected[0] + 10)  # 10 dB less to reach
 
 
+def test_noise_is_that_of_a_transmission(stage, monkeypatch):
+    """A packet on 3 of 51 blocks of 12 x 30 kHz meets noise on 1.08 MHz, all power is on these."""
+    pytest.importorskip("sionna")
+    of_one = load_simulator.OneLoad("hold-true", "round-robin", 20.0, 0, 1.0)
+    flags = {**SMALL, "radio.phy": "nr", "radio.topology": "hall", "radio.power_dbm": -30.0}
+    seen = []
+
+    def simulate_cell(*arguments, **tick):
+        seen.append(arguments[4])
+        raise StopIteration
+
+    monkeypatch.setattr(load_simulator, "simulate_cell", simulate_cell)
+    settings = load_settings(flags=flags)
+    with pytest.raises(StopIteration):
+        of_one.compute(load_simulator.LoadSimulator(settings, None), lambda steps: None)
+    noise_dbm = -174 + 10 * math.log10(3 * 12 * 30e3) + 6
+    drop = drop_devices("InF-SH", 3.75, 300, 0)
+    margin_db = seen[0].margin_db
+    expected_db = -30 - (20 + noise_dbm + drop.loss_db)
+    assert margin_db == pytest.approx(expected_db[: len(margin_db)], abs=1e-6)
+    share = load_simulator.hall_coverage(settings.radio, 20.0, 0, 300, 3 * 12 * 30e3)
+    assert share == pytest.approx((expected_db >= 0).mean())
+
+
 def test_copies_of_a_sample_carry_more_where_many_are_lost(stage):
     lossy = {"schedulers": ["round-robin"], "power_margin_db": 300.0, "block_error": 0.5}
     fresh, copied = (

@@ -58,10 +58,11 @@ class OneLoad:
         """Simulate the load, on the draws of the seed."""
         settings, seed, blocks = simulator.settings, self.seed, blocks_for(self.load)
         radio, devices = settings.radio, round(self.load * blocks)
-        margin_db, k_factor_db = _links(radio, self.snr_db, seed, devices)
         method, levels = simulator.driver(self.method), None
         granted = None if SCHEDULERS[self.scheduler].in_turn else True
         carried = simulator.phy.carries(method.bits_per_transmission, self.snr_db, dynamic=granted)
+        width_hz = carried.allocation_hz
+        margin_db, k_factor_db = _links(radio, self.snr_db, seed, devices, width_hz)
         if radio.uncertainty == "levels" and method.two_levels:
             method = dataclasses.replace(method, controller=method.two_levels)
             levels = simulator.measured(measure_levels, method, seed)
@@ -77,7 +78,7 @@ class OneLoad:
             levels=levels,
             round_trip_slots=carried.round_trip_slots,
             reports=simulator.phy.reports(devices, self.snr_db),
-            motion=simulator.motion(carried.allocation_hz),
+            motion=simulator.motion(width_hz),
         )
         outcome = simulate_cell(
             simulator.plant, settings.protocol, seed, devices, access, method, tick=tick
@@ -178,19 +179,24 @@ class LoadSimulator(Simulator):
         return known[:devices]
 
 
-def hall_coverage(radio: RadioSettings, snr_db: float, seed: int, devices: int) -> float:
-    """Return the share of devices in a hall whose power suffices for an SNR at mean fading."""
-    margin_db, _ = _links(radio, snr_db, seed, devices)
+def hall_coverage(
+    radio: RadioSettings, snr_db: float, seed: int, devices: int, allocation_hz: float
+) -> float:
+    """Return the share of devices in a hall whose power suffices for an SNR at mean fading.
+
+    Their power and the noise they have to exceed are on ``allocation_hz`` of the band.
+    """
+    margin_db, _ = _links(radio, snr_db, seed, devices, allocation_hz)
     return float(np.mean(np.asarray(margin_db) >= 0))
 
 
 def _links(
-    radio: RadioSettings, snr_db: float, seed: int, devices: int
+    radio: RadioSettings, snr_db: float, seed: int, devices: int, allocation_hz: float
 ) -> tuple[float | Floats, float | Floats]:
     """Return the power margin and the Rician K of the devices, both in dB."""
     if radio.topology == "target":
         return radio.power_margin_db, -math.inf
     drop = drop_devices(radio.scenario, radio.carrier_ghz, devices, seed)
-    noise_dbm = thermal_noise_dbm(radio.bandwidth_hz, radio.noise_figure_db)
+    noise_dbm = thermal_noise_dbm(allocation_hz, radio.noise_figure_db)
     margin_db = power_margin_db(radio.power_dbm, snr_db, drop.loss_db, noise_dbm)
     return margin_db, drop.k_factor_db
