@@ -142,6 +142,9 @@ def test_friction_dead_zone_and_late_drives_change_what_moves_the_cart() -> None
     kind = plant("desktop")
     moved = step_of("viscous=2", [1.0], start)
     np.testing.assert_allclose(moved, kind.advance(start, 1.0 - 2 * start[:, 1]), atol=2e-6)
+    # A saturated drive does not make up for friction.
+    braked = step_of("viscous=2", [25.0], backwards := start * [1, 0, 1, 1] - [0, 1, 0, 0])
+    np.testing.assert_allclose(braked, kind.advance(backwards, np.full(6, 20.0 + 2)), atol=2e-5)
     rolling = start * [1, 0, 0, 0] + [0, 0.05, 0, 0]
     # 0.3 kg slow down by F/m: 0.3 N for 1 ms take 1 mm/s, and the pole leaves that as it is.
     dry = step_of("coulomb=0.3", [0.0], rolling)

@@ -1,5 +1,7 @@
 """Devices may be worn: heavier, with friction, and with drives that answer late or not at all."""
 
+import dataclasses
+import math
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -8,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hjepa_cli.core.arrays import Bools, Floats, finite
+from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
 from hjepa_cli.core.plants.system import Camera, Simulation, System, Teacher
 from hjepa_cli.errors import UsageError
 
@@ -32,8 +35,11 @@ class Worn(System):
         vars(self).update(
             {name: getattr(kind, name) for name in (*names, "action_shape", "mirror")}
         )
-        if not hasattr(kind, "cart_mass_kg") and (lacking := [*filter(wear.get, FRICTION)]):
-            raise UsageError(f"condition {lacking[0]} is of carts; plant {kind.name} has none")
+        rubbing = [name for name in FRICTION if wear.get(name)]
+        if rubbing and not isinstance(kind, CartPolePlant):
+            raise UsageError(f"condition {rubbing[0]} is of carts; plant {kind.name} has none")
+        # Friction acts beside the drive, which alone has a limit: it brakes a saturated one, too.
+        self._driven = dataclasses.replace(kind, force_limit_n=math.inf) if rubbing else kind  # type: ignore[type-var]
 
     def __getattr__(self, name: str) -> Any:
         """Return what the plant alone has, as the numbers of a cart-pole."""
@@ -45,7 +51,7 @@ class Worn(System):
         """Return ``devices`` worn ones."""
         scale = np.ones((devices, 2)) if mass_scale is None else np.asarray(mass_scale, float)
         factor = self._wear.get("mass", 1.0)
-        return _Simulation(self, self._kind.simulation(devices, mass_scale=factor * scale))
+        return _Simulation(self, self._driven.simulation(devices, mass_scale=factor * scale))
 
     def moving_n(self, forces_n: Floats, states: Floats) -> Floats:
         """Return what moves devices in states [n, S] where they are told forces [n, *A]."""
