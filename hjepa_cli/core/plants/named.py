@@ -26,7 +26,6 @@ from hjepa_cli.core.plants.system import Camera as SystemCamera
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.errors import ArrayError, UsageError
 
-VERSIONED = ("desktop", "gym")
 IDEAL = SensorSettings()
 Section = TypeVar("Section")
 START = np.array([0.03, 0.1, 0.08, 0.5])  # m, m/s, rad, rad/s: where a seeded CartPole starts
@@ -140,10 +139,10 @@ def camera_of(kind: System, size: CameraSettings, sensor: SensorSettings = IDEAL
 def definition(name: str) -> str | None:
     """Return the digest of the file that defines a plant: measurements depend on it.
 
-    ``None`` for the plants of the zoo: :data:`hjepa_cli.core.control.loop.LOOP_VERSION` tells
-    theirs apart.
+    ``None`` for the package's own: :data:`hjepa_cli.core.control.loop.LOOP_VERSION` tells theirs
+    apart.
     """
-    if name in VERSIONED:
+    if name in plugins.BUILT_IN["plant"]:
         return None
     if source := plugins.PLANTS.source(name):
         return source.sha256
