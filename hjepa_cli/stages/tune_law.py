@@ -15,7 +15,7 @@ from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.plants.control_law import instability
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.law_search import GAPS, LawSearch
-from hjepa_cli.errors import NumericalError
+from hjepa_cli.errors import NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.inputs import refuse_recorded
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
@@ -32,7 +32,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     Raises:
         NumericalError: the search found no law that holds the plant; both are written all the same.
     """
-    refuse_recorded(settings, WHY)
+    _check(settings)
     kind = plant(settings.plant)
     with Run.create("tune-law", out, settings.as_dict()) as record:
         if record.result is not None:
@@ -77,7 +77,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
 
 def plan(settings: Settings, *, out: Path | None = None) -> Plan:
     """Plan both searches."""
-    refuse_recorded(settings, WHY)
+    _check(settings)
     options, protocol = settings.tune, settings.protocol
     loops = 2 * options.candidates * options.rounds * options.devices * len(GAPS)
     return Plan(
@@ -94,6 +94,22 @@ def plan(settings: Settings, *, out: Path | None = None) -> Plan:
             {"device-steps of searches": 3 * loops * (protocol.warmup_steps + options.steps)}
         ),
     )
+
+
+def _check(settings: Settings) -> None:
+    """Refuse what no law is tuned for.
+
+    Raises:
+        UsageError: recordings; a link that is late or loses forces: whoever drives moves late
+            packets on, the law itself need not know.
+    """
+    refuse_recorded(settings, WHY)
+    if not settings.protocol.ideal_link:
+        raise UsageError(
+            "a law is tuned for packets and forces that arrive at once; those of this link do not",
+            hint="leave delay_steps, jitter_steps and downlink_loss of [protocol] out here: "
+            "controllers move late packets on",
+        )
 
 
 def _show(result: dict[str, Any], screen: Screen) -> None:

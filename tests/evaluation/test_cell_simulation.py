@@ -384,6 +384,18 @@ def test_a_wide_interval_is_not_cut_off_at_the_simulated_loads(spread):
     assert min(calls) < found.interval[0] and found.interval[1] < max(calls)
 
 
+@pytest.mark.parametrize("crossing", [2.3, 3.4])
+def test_few_devices_are_widened_by_one(crossing):
+    """15 % of three devices round to none."""
+    calls = []
+    found = find_load(
+        curve(crossing, calls, spread=0.02), 0.62, 0.03, replicates=5000, seed=0, start=crossing
+    )
+    half = 1.96 * 0.02 / math.sqrt(3) * math.sqrt(41 / 39) / math.sqrt(40) / 0.004
+    assert len(calls) == len(set(calls))
+    assert found.interval == pytest.approx((crossing - half, crossing + half), rel=0.15)
+
+
 @pytest.mark.parametrize("start", [0.0, 1.0, 30.0, 41.5, 60.0, 500.0])
 def test_a_load_near_the_one_to_find_saves_simulations(start):
     calls = []

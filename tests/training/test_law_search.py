@@ -87,6 +87,16 @@ def test_the_command_writes_settings_for_the_next_one(hjepa: Shell) -> None:
     assert again["gains_n"] == result["gains_n"]
 
 
+@pytest.mark.parametrize("link", ["delay_steps = 15", "jitter_steps = 2", "downlink_loss = 0.1"])
+def test_no_law_is_tuned_for_a_late_link(hjepa: Shell, link: str) -> None:
+    """The search has packets arrive at once: gaps that were found otherwise are not its own."""
+    Path("c.toml").write_text(f"[protocol]\n{link}\n")
+    for dry in ((), ("--dry-run",)):
+        outcome = hjepa("tune-law", "--config", "c.toml", "--quiet", *dry)
+        assert_one_line_error(outcome, 2, "arrive at once", "delay_steps, jitter_steps")
+    assert not Path("runs").exists()
+
+
 def test_a_search_that_found_no_law_leaves_what_it_found(
     hjepa: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -101,8 +101,8 @@ def find_load(
     for remaining in range(MAX_WIDENINGS, -1, -1):
         ascending = [points[load] for load in sorted(points)]
         crossing, least, most = _crossings(ascending, acceptable_score, replicates, seed)
-        outside = [round(min(points) / WIDER)] * math.isinf(least)
-        outside += [round(max(points) * WIDER)] * math.isinf(most)
+        outside = [min(round(min(points) / WIDER), min(points) - 1)] * math.isinf(least)
+        outside += [max(round(max(points) * WIDER), max(points) + 1)] * math.isinf(most)
         outside = [load for load in outside if math.isfinite(crossing) and 1 <= load <= MAX_LOAD]
         if not outside or not remaining:
             break
