@@ -315,8 +315,8 @@ _LOOP = {
     "protocol": Input(
         str,
         "--protocol",
-        "Score steady state, after a warm-up, or as the paper does from the start on, for its "
-        "Fig. 3 and 4.",
+        "Score steady state, after a warm-up, or from the start on, as for the paper's Fig. 3 "
+        "and 4.",
         "|".join(PROTOCOLS),
         shown=PROTOCOLS[0],
         complete=lambda: list(PROTOCOLS),
