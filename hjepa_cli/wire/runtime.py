@@ -5,6 +5,7 @@ controller's batches are small. OpenVINO is fast with fixed shapes only, so that
 up to the next of :data:`~hjepa_cli.wire.bundle.BUCKETS`.
 """
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ PRECISIONS = ("fp32", "int8")
 
 
 class Runtime:
-    """It computes the networks of a bundle, each loaded when it is first used.
+    """It computes the networks of a bundle, each loaded when first used; threads may share it.
 
     Forces are [..., m] in newton, of one force m = 1.
 
@@ -136,9 +137,12 @@ def _openvino(path: Path, name: str) -> Network:
     except Exception as error:
         raise DataError(f"openvino cannot load network '{name}': {_first(error)}") from None
 
+    one_at_a_time = threading.Lock()  # a request keeps its inputs and outputs in one place
+
     def run(*inputs: NDArray[Any]) -> list[NDArray[Any]]:
-        outputs = compiled[len(inputs[0])].infer(dict(enumerate(inputs)), share_inputs=True)
-        return [np.array(outputs[port]) for port in outputs]
+        with one_at_a_time:
+            outputs = compiled[len(inputs[0])].infer(dict(enumerate(inputs)), share_inputs=True)
+            return [np.array(outputs[port]) for port in outputs]
 
     return run
 
