@@ -8,12 +8,14 @@ before a runtime sees a byte of them.
 import dataclasses
 import hashlib
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 from hjepa_cli.core.plants.frames import LONGEST
 from hjepa_cli.errors import DataError, MissingInputError, shell
 from hjepa_cli.storage import files
+from hjepa_cli.wire import protocol
 
 SCHEMA = 1
 MANIFEST = "manifest.json"
@@ -21,6 +23,7 @@ CHECK = "check.json"
 NETWORKS = ("encoder", "encoder-int8", "planner", "coarse", "fine", "actor")
 BUCKETS = (1, 4, 16, 64)  # batches that runtimes with fixed shapes compile
 _LIMIT_BYTES = 512 * 2**20
+_NAME = re.compile("[!-~]{1,16}")  # of a plant, as a hello holds it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +144,7 @@ def open_bundle(directory: Path) -> Bundle:
             and gap * (manifest["frames"] - 1) < LONGEST
             and bundle.force_limit_n > 0
             and bundle.step_s > 0
-            and 0 < len(bundle.plant.encode()) <= 16
+            and isinstance(manifest["plant"], str)
             and isinstance(manifest["camera"], dict)
             and set(networks) <= set(NETWORKS)
             and all(set(entry["files"]) == set(files_of(name)) for name, entry in networks.items())
@@ -150,4 +153,23 @@ def open_bundle(directory: Path) -> Bundle:
         good = False
     if not good:
         raise DataError(f"{path} lacks entries or has malformed ones", hint=_again(bundle))
+    if why := too_large(bundle.plant, bundle.embedding, bundle.axes, bundle.stride):
+        raise DataError(f"{path}: {why}", hint=_again(bundle))
     return bundle
+
+
+def too_large(plant: str, embedding: int, axes: int, stride: int) -> str | None:
+    """Return why datagrams do not hold what a model of D values and h · m forces sends, if so.
+
+    The other side would drop them as malformed, and nobody would hear of it.
+    """
+    if not _NAME.fullmatch(plant):
+        return f"plant {plant!r}; on the wire a name has 1 to 16 ASCII characters and no spaces"
+    if stride * axes > protocol.MOST_FORCES:
+        return (
+            f"strides of {stride} steps of {axes} forces; a datagram holds {protocol.MOST_FORCES} "
+            "forces"
+        )
+    if (excess := protocol.embedding_bytes(embedding, axes) - protocol.LARGEST_BYTES) > 0:
+        return f"embeddings of {embedding} values; a datagram holds {embedding - excess}"
+    return None

@@ -27,7 +27,7 @@ from hjepa_cli.wire.bundle import BUCKETS, Bundle
 from hjepa_cli.wire.protocol import Answer, Embedding, Forces, Hello
 from hjepa_cli.wire.runtime import Runtime, Singles
 
-WINDOW_STEPS = 16  # forces in a datagram: its stride's, and those of the strides before
+WINDOW_STEPS = 16  # of forces in a datagram: its stride's, and those of strides before that fit
 REPEATS = 7  # of an answer, one a step: what loses it loses the next datagram too, perhaps
 LEAD_STEPS = 12  # that forces are computed ahead of the device, at least
 CLOCK_INTERVALS = 3  # all of which a device must be slow in to be taken for slow
@@ -121,7 +121,10 @@ class Session:
         source: of the device's last force.
     """
 
-    def __init__(self, hello: Hello, key: bytes, address: Address, now_s: float) -> None:
+    def __init__(
+        self, hello: Hello, key: bytes, address: Address, now_s: float, stride: int
+    ) -> None:
+        self._window = max(stride, min(WINDOW_STEPS, protocol.MOST_FORCES // hello.forces))
         self.hello, self.key, self.address = hello, key, address
         self.heard_s, self.replies = now_s, auth.ReplayWindow()
         self.clock = Clock(hello.period_us / 1e6)
@@ -183,7 +186,7 @@ class Session:
 
     def datagram(self) -> bytes:
         """Return the newest forces as a datagram."""
-        first = max(self.start, self.planned - WINDOW_STEPS)
+        first = max(self.start, self.planned - self._window)
         forces_n = self.forces_n(first, self.planned - first)
         self.counter += 1
         message = Forces(self.hello.device, self.counter, self.base, first, forces_n)
@@ -299,7 +302,8 @@ class Controller:
         if reason == protocol.WELCOME:
             key = auth.session_key(self._key, hello.device, hello.nonce, server_nonce)
             self._pending.pop(hello.device, None)
-            self._pending[hello.device] = Session(hello, key, address, now_s)
+            session = Session(hello, key, address, now_s, self.bundle.stride)
+            self._pending[hello.device] = session
             while len(self._pending) > PENDING:
                 self._pending.popitem(last=False)
         else:

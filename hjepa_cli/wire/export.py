@@ -49,6 +49,7 @@ from hjepa_cli.wire.bundle import (
     Bundle,
     files_of,
     open_bundle,
+    too_large,
 )
 from hjepa_cli.wire.runtime import Runtime
 
@@ -206,20 +207,32 @@ def check_pictures(model: Model, path: Path) -> None:
         raise UsageError(f"{path} sees pictures of {sizes[0]}; devices take those of {sizes[1]}")
 
 
+def check_sizes(model: Model, path: Path, method: str) -> None:
+    """Raise UsageError for a model whose embeddings or strides are larger than a datagram."""
+    axes, stride = math.prod(model.action_shape), planner_of(model, method).stride
+    if why := too_large(model.plant_name, model.architecture["embedding"], axes, stride):
+        raise UsageError(
+            f"{path}: {why}",
+            hint="hjepa models list, or train one: --h and encoder.embedding make it smaller",
+        )
+
+
 def exportable(path: Path, directory: Path, method: str | None) -> tuple[Model, str]:
     """Return the model of a checkpoint that may be exported to a directory, and the method.
 
     Raises:
-        UsageError: the model has no such planner, its pictures are none that devices take, or the
-            directory holds something else.
+        UsageError: the model has no such planner, its pictures are none that devices take,
+            datagrams do not hold what it sends, or the directory holds something else.
         MissingInputError: onnx, onnxscript or onnxruntime are not installed.
     """
     model = load_fp32(path)
     check_pictures(model, path)
+    method = exported_method(model, method)
+    check_sizes(model, path, method)
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, f"export needs {module}", "export")
     files.refuse_foreign(directory, "exported model", OURS.__contains__)
-    return model, exported_method(model, method)
+    return model, method
 
 
 def export(path: Path, directory: Path, method: str | None) -> Bundle:

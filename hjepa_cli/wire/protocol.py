@@ -164,6 +164,11 @@ def pack_embedding(m: Embedding) -> bytes:
     return head + m.forces_n.astype("<f4").tobytes() + m.codes.tobytes()
 
 
+def embedding_bytes(embedding: int, forces: int) -> int:
+    """Return the length of an embedding's datagram with its tag, of D codes and m forces."""
+    return _EMBEDDING.size + 4 * forces + embedding + TAG_BYTES
+
+
 def pack_forces(m: Forces) -> bytes:
     """Return forces' datagram without its tag."""
     steps, axes = m.forces_n.shape

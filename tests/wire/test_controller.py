@@ -1,6 +1,7 @@
 """Controller and device as state machines: what any network may do to them, without a network."""
 
 import tracemalloc
+from pathlib import Path
 
 import linear
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from hjepa_cli.wire import auth, protocol
 from hjepa_cli.wire import controller as controllers
+from hjepa_cli.wire.bundle import Bundle
 from hjepa_cli.wire.device import Device, EverySteps, OnInnovation
 
 # Of int8: half a code of a vector whose largest value is some 4, in eight values, through the law.
@@ -62,6 +64,27 @@ def test_lost_datagrams_are_made_good_by_the_next_ones():
     errors = world.run(200, gap=200)
     assert linear.planned_steps(one) == 200
     assert errors.max() < CODED
+
+
+@pytest.mark.parametrize(("stride", "axes"), [(4, 6), (4, 16), (64, 1), (20, 3)])
+def test_datagrams_hold_a_stride_of_any_length_and_no_more_forces_than_devices_take(stride, axes):
+    class Counting:
+        """It plans as many forces as it is to."""
+
+        def plan(self, z):
+            return np.ones((len(z), stride, axes), np.float32), z
+
+    manifest = linear.bundle().manifest | {"stride": stride, "action_shape": [axes]}
+    made = Bundle(Path("."), manifest, bytes(32))
+    server = controllers.Controller(made, Counting(), linear.KEY)
+    one = Device(made, 1, linear.KEY, linear.PERIOD_S)
+    linear.connect(server, one)
+    server.receive(one.embed(0, np.zeros(linear.SIZE, np.float32)), 1, 0.0)
+    for k in range(160):
+        for data, _ in linear.settle(server, k * linear.PERIOD_S):
+            one.receive(data, k, k * linear.PERIOD_S)
+        one.play(k)
+    assert linear.planned_steps(one) == 160 and not one.ignored
 
 
 def test_what_an_older_embedding_foresaw_is_never_played_after_a_newer_one():
