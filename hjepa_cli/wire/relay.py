@@ -32,6 +32,7 @@ _KEY = 0x2E1A
 MOST_CLIENTS = 16_384
 SPARE_FILES = 32  # descriptors that clients' ports leave to everything else
 MOST_WAITING = 200_000  # datagrams in the relay
+LONGEST_STEPS = 2**31  # of a delay: no loop lasts so long
 LOST = "lost"
 
 
@@ -90,7 +91,8 @@ class Trace:
         starts = (np.arange(devices) * len(delays_ms)) // devices
         of = delays_ms[(np.arange(steps)[:, None] + starts) % len(delays_ms)]
         lost = np.isnan(of)
-        extra = np.rint(np.where(lost, 0.0, of) / step_ms).astype(np.int16)
+        steps_late = np.rint(np.where(lost, 0.0, of) / step_ms)
+        extra = steps_late.clip(max=LONGEST_STEPS).astype(np.int64)
         return LinkDraws(0, extra if extra.any() else None, None), lost
 
 
@@ -120,11 +122,13 @@ class Impairment:
     trace: Trace | None = None
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a burst that the loss does not allow."""
-        if self.loss and self.burst * (1 - self.loss) < self.loss:
+        """Raise UsageError for a loss that bursts with a good datagram in between cannot make."""
+        most = self.burst / (1 + self.burst)
+        if self.burst > 1 and self.loss > most:
             raise UsageError(
-                f"a loss of {self.loss:g} in bursts of {self.burst:g} datagrams: bursts must last "
-                f"at least {self.loss / (1 - self.loss):g}"
+                f"a loss of {self.loss:g} in bursts of {self.burst:g} datagrams; such bursts lose "
+                f"at most {most:g}",
+                hint="longer bursts, or none (1), which are independent losses",
             )
 
 

@@ -56,7 +56,7 @@ def refused(shell, code, *arguments, says=()):
         (["device", "--model", "m", "--gap-steps", "9", "--innovation", "0.1"], 2, ["two rules"]),
         (["link", "--listen", "127.0.0.1:4747"], 2, ["same address"]),
         (["link", "--uplink-loss", "1"], 2, ["less than 1"]),
-        (["link", "--uplink-loss", "0.9", "--uplink-burst", "2"], 2, ["bursts must last"]),
+        (["link", "--uplink-loss", "0.9", "--uplink-burst", "2"], 2, ["at most 0.666"]),
         (["link", "--uplink-trace", "nowhere"], 66, ["nowhere does not exist"]),
         (["bench-link", "--model", "nowhere"], 66, ["no exported model"]),
         (["bench-link", "--model", "m", "--lockstep", "--period-ms", "5"], 2, ["--lockstep"]),

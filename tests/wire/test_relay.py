@@ -42,8 +42,15 @@ def test_bursts_of_losses():
     # Of a geometric length of mean 5 the deviation is √20; of the share, what bursts make of it.
     assert abs(lengths.mean() - 5.0) < 4 * np.sqrt(20 / len(lengths))
     assert abs(found.mean() - 0.2) < 4 * np.sqrt(0.2 * 0.8 * 9 / N)
-    with pytest.raises(UsageError, match="bursts must last"):
-        Impairment(loss=0.9, burst=2.0)
+
+
+@pytest.mark.parametrize("share", [0.6, 1.0])
+def test_independent_losses_may_be_any_share_and_bursts_no_more_than_they_can_make(share):
+    """Between bursts of b datagrams at least one arrives: b ÷ (b + 1) are lost at most."""
+    assert abs(lost(Impairment(loss=share)).mean() - share) <= 4 * np.sqrt(0.24 / N)
+    with pytest.raises(UsageError, match=r"bursts of 1\.25 datagrams; .* at most 0\.555556"):
+        Impairment(loss=share, burst=1.25)
+    assert Impairment(loss=0.8, burst=4.0).loss == 0.8  # on the bound
 
 
 def test_delay_and_jitter():
@@ -87,6 +94,12 @@ def test_a_trace_is_played_to_datagrams_and_to_the_simulator(tmp_path):
     assert draws.extra_steps[:, 0].tolist() == [3, 0, 0, 8, 3, 0]
     assert gone[:, 0].tolist() == [False, True, False, False, False, True]
     assert gone[:, 1].tolist() == [False, False, False, True, False, False]  # from another place
+
+
+@pytest.mark.parametrize("delay_ms", [32_768.0, 1e300])
+def test_delays_of_a_trace_are_never_negative(delay_ms):
+    draws, _ = Trace((delay_ms, 1.0)).draws(steps=2, devices=1, step_ms=1.0)
+    assert draws.extra_steps[1] == 1 and draws.extra_steps[0] >= 32_768
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "3\nsoon\n", "-1\n", "nan\n", "inf\n"])

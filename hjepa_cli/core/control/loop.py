@@ -150,7 +150,7 @@ class LinkDraws:
     """
 
     delay_steps: int = 0
-    extra_steps: NDArray[np.int16] | None = None
+    extra_steps: NDArray[np.integer[Any]] | None = None
     lost: Bools | None = None
     lead_steps: int = 0
 
