@@ -9,7 +9,7 @@ from typing import Protocol
 from hjepa_cli.errors import Unavailable, UsageError
 from hjepa_cli.wire.runtime import Singles
 
-BAUD = 115_200
+BAUD = termios.B115200
 
 
 class Actuator(Protocol):
@@ -40,7 +40,7 @@ class SerialCartPole:
     watchdog. It has been tried against a pseudo-terminal, never on hardware.
     """
 
-    def __init__(self, port: Path, baud: int = BAUD) -> None:
+    def __init__(self, port: Path) -> None:
         try:
             self._port = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         except OSError as error:
@@ -48,28 +48,35 @@ class SerialCartPole:
         try:
             tty.setraw(self._port)
             settings = termios.tcgetattr(self._port)
-            settings[4] = settings[5] = getattr(termios, f"B{baud}")
+            settings[4] = settings[5] = BAUD
             termios.tcsetattr(self._port, termios.TCSANOW, settings)
         except termios.error as error:
             os.close(self._port)
             raise Unavailable(f"{port} is no serial port: {error.args[-1]}") from None
-        self._name = port
+        self._name, self._begun = port, b""
 
     def play(self, forces_n: Singles) -> None:
-        """Write the line of a step; what a full buffer does not take is lost, as it is late."""
+        """Write the line of a step behind the end of one that a full buffer took a part of.
+
+        A line that it takes nothing of is left out, as it would be late.
+        """
+        line = f"u {forces_n[0]:+.3f}\n".encode()
         try:
-            os.write(self._port, f"u {forces_n[0]:+.3f}\n".encode())
+            taken = os.write(self._port, self._begun + line)
         except BlockingIOError:
-            pass
+            return
         except OSError as error:
             raise Unavailable(f"serial port {self._name}: {error.strerror}") from None
+        if taken > len(self._begun):
+            self._begun += line
+        self._begun = self._begun[taken:]
 
     def close(self) -> None:
-        """Write 0 N, thrice, and close the port."""
+        """Drop what waits, write 0 N on a line of its own, thrice, and close the port."""
         try:
-            for _ in range(3):
-                os.write(self._port, b"u +0.000\n")
-        except OSError:
+            termios.tcflush(self._port, termios.TCOFLUSH)  # a full buffer has no room for 0 N
+            os.write(self._port, b"\n" + 3 * b"u +0.000\n")
+        except (OSError, termios.error):
             pass
         finally:
             os.close(self._port)

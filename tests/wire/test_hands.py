@@ -2,6 +2,7 @@
 
 import os
 import pty
+import select
 
 import numpy as np
 import pytest
@@ -101,17 +102,50 @@ def test_a_directory_of_pictures_is_replayed_in_order(tmp_path):
         open_camera("nonsense", None, lambda: None)
 
 
-def test_the_serial_cart_pole_writes_newton_and_leaves_none():
+@pytest.fixture
+def serial():
+    """A serial cart-pole, and the end of its line that a microcontroller reads."""
     ours, theirs = pty.openpty()
-    actuator = open_actuator(f"serial:{os.ttyname(theirs)}", 1)
-    actuator.play(np.array([-2.5], np.float32))
-    actuator.close()
-    expected, found = b"u -2.500\n" + 3 * b"u +0.000\n", b""
-    while len(found) < len(expected):
-        found += os.read(ours, 100)
-    assert found == expected
+    yield open_actuator(f"serial:{os.ttyname(theirs)}", 1), ours
     os.close(ours)
     os.close(theirs)
+
+
+ZERO = b"\n" + 3 * b"u +0.000\n"
+
+
+def read(ours, last):
+    """Read until ``last`` has come, or nothing for two seconds."""
+    found = b""
+    while not found.endswith(last) and select.select([ours], [], [], 2.0)[0]:
+        found += os.read(ours, 4096)
+    return found
+
+
+def test_the_serial_cart_pole_writes_newton_and_leaves_none(serial):
+    actuator, ours = serial
+    actuator.play(np.array([-2.5], np.float32))
+    assert read(ours, b"\n") == b"u -2.500\n"
+    actuator.close()
+    assert read(ours, ZERO) == ZERO
+
+
+def test_a_full_serial_port_tears_no_line_and_is_told_0_newton_at_last(serial):
+    actuator, ours = serial
+    forces_n = np.array([[12.5], [-2.5]], np.float32)  # no buffer ends with a line of both lengths
+
+    def play(lines):
+        for k in range(lines):
+            actuator.play(forces_n[k % 2])
+
+    play(20_000)  # twice what it takes
+    found = b""
+    for _ in range(40):
+        found += os.read(ours, 4096)
+        play(600)
+    assert set(found.split(b"\n")[:-1]) == {b"u +12.500", b"u -2.500"}
+    actuator.close()
+    assert read(ours, ZERO).endswith(ZERO)
 
 
 def test_actuators_that_are_none(tmp_path):
