@@ -41,10 +41,8 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
     An error inside leaves the old file.
     """
-    # Workers in containers have equal pids, and two may write the same shard at the same time.
     _refuse_special(path)
-    unique = f"{secrets.token_hex(4)}.{os.getpid()}"
-    temporary = path.with_name(f".{path.name}.{unique}.tmp")
+    temporary = _temporary(path)
     try:
         with writing(path):
             _check_held(path.parent)
@@ -64,6 +62,33 @@ def write_bytes(path: Path, data: bytes) -> None:
     """Replace ``path`` by ``data`` atomically, with a mode by the umask; else StorageError."""
     with replacing(path) as file:
         file.write(data)
+
+
+def create_private(path: Path, data: bytes) -> None:
+    """Make ``path``, which its owner alone may read, with all of ``data`` in it, or not at all.
+
+    What is there already stays, with a StorageError, as where the disk refuses.
+    """
+    temporary = _temporary(path)
+    try:
+        with writing(path):
+            handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with open(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                _sync(file.fileno())
+            os.link(temporary, path)  # unlike a rename it replaces nothing
+            temporary.unlink()
+            _sync_directory(path.parent)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def _temporary(path: Path) -> Path:
+    # Workers in containers have equal pids, and two may write the same shard at the same time.
+    unique = f"{secrets.token_hex(4)}.{os.getpid()}"
+    return path.with_name(f".{path.name}.{unique}.tmp")
 
 
 def append(path: Path, data: bytes, *, durable: bool = False) -> None:

@@ -67,12 +67,7 @@ def make_key(path: Path) -> bytes:
     """Write a new key of 32 random bytes that its owner alone may read, and return it."""
     key = secrets.token_bytes(32)
     files.make_directory(path.parent)
-    with files.writing(path):
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
-        with open(handle, "wb") as file:
-            file.write(key)
-            file.flush()
-            os.fsync(file.fileno())
+    files.create_private(path, key)
     return key
 
 

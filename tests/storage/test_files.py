@@ -77,6 +77,25 @@ def test_a_failing_write_keeps_the_old_file(
     assert (tmp_path / "a").read_bytes() == b"old"
 
 
+@pytest.mark.parametrize("failing", ["fsync", "link"])
+def test_a_private_file_is_there_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(os, failing, refuse)
+        with pytest.raises(StorageError, match="No space left"):
+            files.create_private(tmp_path / "a", b"key")
+    assert os.listdir(tmp_path) == []
+    files.create_private(tmp_path / "a", b"key")
+    with pytest.raises(StorageError, match="File exists"):
+        files.create_private(tmp_path / "a", b"other")
+    assert (tmp_path / "a").read_bytes() == b"key" and os.listdir(tmp_path) == ["a"]
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o600
+
+
 def test_full_disk(tmp_path: Path) -> None:
     """A file size limit makes the kernel refuse the write, as a full disk or a quota does."""
     files.write_bytes(tmp_path / "a", b"old")

@@ -1,5 +1,6 @@
 """Datagrams: what one side packs the other reads, and nothing else is read at all."""
 
+import resource
 import struct
 import tracemalloc
 
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjepa_cli.core.control.codecs.integers import Integers
+from hjepa_cli.errors import DataError, MissingInputError, StorageError
 from hjepa_cli.wire import auth, protocol
 from hjepa_cli.wire.protocol import Answer, Bye, Embedding, Forces, Hello
 
@@ -166,8 +168,6 @@ def test_the_replay_window_accepts_each_step_once(steps):
 
 
 def test_keys_are_made_safe_and_refused_where_others_may_read(tmp_path):
-    from hjepa_cli.errors import DataError, MissingInputError
-
     path = tmp_path / "deep" / "wire.key"
     with pytest.raises(MissingInputError, match="does not exist"):
         auth.key_of(path)
@@ -181,6 +181,19 @@ def test_keys_are_made_safe_and_refused_where_others_may_read(tmp_path):
     path.write_bytes(b"short")
     with pytest.raises(DataError, match="5 bytes"):
         auth.key_of(path)
+
+
+def test_a_full_disk_leaves_no_key_that_is_empty(tmp_path):
+    """The kernel refuses the bytes and not the name, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        with pytest.raises(StorageError, match="too large"):
+            auth.key_of(tmp_path / "wire.key", make=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+    assert len(auth.key_of(tmp_path / "wire.key", make=True)) == 32
 
 
 def test_parsing_keeps_nothing():
