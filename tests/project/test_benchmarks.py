@@ -81,6 +81,30 @@ def test_a_failing_command_ends_the_benchmark_with_its_code_and_words(
     assert "in all" not in shown.out
 
 
+def test_the_memory_of_a_device_is_not_that_of_its_server(tmp_path: Path) -> None:
+    """Of a program that is small as a device and takes 200 MB as a server."""
+    package = tmp_path / "hjepa_cli"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "__main__.py").write_text(
+        "import json, sys, time\n"
+        "if sys.argv[1] == 'serve':\n"
+        "    held = bytearray(b'x') * 200_000_000\n"
+        "    print(json.dumps({'serving': 'here'}), flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, BENCHMARKS / "wire.py", "exported", "start", "--rounds", "1"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert not ran.returncode, ran.stderr
+    assert int(re.findall(r"peak (\d+) MB", ran.stdout)[0]) < 100
+
+
 def test_the_training_step_is_measured_against_its_promises() -> None:
     shortfalls = load("train_step").shortfalls
     assert shortfalls({"hjepa": 1.0, "bare": 0.9, "shared": 0.1, "plain": 5.0}) == []
