@@ -111,7 +111,7 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise NumericalError(f"the action is not finite at step {self._k}: {share}")
         force_n = min(max(share, -1.0), 1.0) * limit_n
         score = cost = 0.0
-        steps = min(self._repeat, self._protocol.steps - self._k) or 1
+        steps = max(1, min(self._repeat, self._protocol.steps - self._k))  # after the end, too
         for _ in range(steps):
             state = self._pole.state
             score += float(kind.in_band(state))

@@ -118,6 +118,24 @@ def test_an_episode_ends_by_time_under_the_teacher_and_by_falling_without():
     assert abs(x_m) > 0.3 or abs(theta_rad) > np.pi / 2
 
 
+@pytest.mark.parametrize("repeat", [1, 7])
+def test_after_the_end_the_plant_goes_on_by_single_steps(repeat):
+    """As under Gymnasium's own time limit: still truncated, with the rewards of what happens."""
+    env = gymnasium.make(IDS[0], plant="gym", noise=False, action_repeat=repeat).unwrapped
+    _, info = env.reset(seed=0)
+    action, pole = np.full(1, 0.125, np.float32), CartPole("gym")  # 2.5 N
+    truncated, steps = False, 0
+    while not truncated:
+        _, _, _, truncated, info = env.step(action)
+        steps += 1
+    assert steps == -(-300 // repeat)
+    for _ in range(3):
+        pole.state = info["state"]
+        _, reward, _, truncated, info = env.step(action)
+        assert truncated and reward <= 1 - 0.05 * 2.5**2 / 50  # R u², at least
+        np.testing.assert_allclose(info["state"], pole.step(2.5), atol=1e-9)
+
+
 def test_pixels_are_the_cameras_and_stack_to_what_encoders_take():
     env = gymnasium.wrappers.FrameStackObservation(gymnasium.make(IDS[1]), 2)
     env.reset(seed=0)
