@@ -120,7 +120,7 @@ def _check_survival(settings: Settings, given: Given) -> None:
     from hjepa_cli.core.radio.capacity import parse_snr
 
     parse_snr(settings.radio.snr_db)
-    check_cell(settings.radio, nr=settings.nr)
+    check_cell(settings.radio, nr=settings.nr, command="survive")
 
 
 def _add_sources(settings: Settings, given: Given) -> None:

@@ -64,12 +64,16 @@ def placed(workers: int | None = None, cluster: str | None = None) -> Iterator[N
     """Place all parallel work inside the ``with`` block.
 
     Raises:
-        UsageError: a cluster without Dask installed.
+        UsageError: a cluster without Dask installed, that cannot be one, or beside no workers.
     """
     if cluster is not None and importlib.util.find_spec("distributed") is None:
         raise UsageError(
             "--cluster needs Dask, which is not installed", hint='pip install "hjepa[cluster]"'
         )
+    if cluster not in (None, LOCAL):
+        scheduler_address(cluster)  # now, and not when all that is cached has been told
+    if cluster is not None and workers == 0:
+        raise UsageError(f"--workers 0 is this process alone, --cluster {cluster} is elsewhere")
     token = _placement.set(Placement(workers, cluster))
     try:
         yield
@@ -274,9 +278,15 @@ def scheduler_address(where: str) -> str:
     """Return the address of a scheduler, from its JSON file where ``where`` is one.
 
     Raises:
-        UsageError: the file is none that a scheduler writes.
+        UsageError: it is neither, or the file is none that a scheduler writes.
     """
     if not Path(where).exists():
+        if ":" not in where:
+            raise UsageError(
+                f"--cluster {where}: no such file; expected local, HOST:PORT of a Dask scheduler, "
+                "or its JSON file",
+                hint="dask scheduler --scheduler-file scheduler.json",
+            )
         return where
     try:
         found = json.loads(plugins.read_regular(Path(where)))

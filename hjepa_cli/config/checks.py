@@ -203,6 +203,8 @@ def check_cell(
     radio: RadioSettings,
     given: Mapping[str, object] = MappingProxyType({}),
     nr: NrSettings = DEFAULT_NR,
+    *,
+    command: str = "scale",
 ) -> None:
     """Raise UsageError for what was set of a cell and is not read, naming what would read it.
 
@@ -222,7 +224,7 @@ def check_cell(
         if layers and radio.phy not in layers:
             raise UsageError(
                 f"{named} is for the physical layer {' or '.join(layers)}, this is {radio.phy}",
-                hint=f"hjepa scale --phy {layers[0]} …, {leave}",
+                hint=f"hjepa {command} --phy {layers[0]} …, {leave}",
                 key=where,
             )
         laws = [law for law in LAWS if key in LAWS[law].uses]
@@ -280,7 +282,9 @@ def check_uplink(radio: RadioSettings) -> None:
             )
 
 
-def changed(of: RadioSettings | NrSettings, section: str = "radio") -> dict[str, Any]:
+def changed(
+    of: RadioSettings | NrSettings | ProtocolSettings, section: str = "radio"
+) -> dict[str, Any]:
     """Return the settings of a section that are not as declared, by dotted key."""
     values = {field: getattr(of, field.name) for field in dataclasses.fields(of)}
     return {f"{section}.{field.name}": v for field, v in values.items() if v != field.default}

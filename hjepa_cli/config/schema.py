@@ -475,7 +475,7 @@ class ConditionSettings:
         Flag(
             "--condition",
             "Conditions of devices and pictures that no model was trained for, as "
-            "light=0.7+noise=8; hjepa eval --stress tells their names.",
+            "light=0.7+noise=8; ? is answered with all names.",
             "NAME=VALUE+…",
         ),
     ] = ""
@@ -737,7 +737,7 @@ class Settings:
             "--stress",
             "Measure, instead of curves, how scores hold under conditions: audit (a fixed set), "
             "all, or names with or without a value, separated by commas, several joined by +: "
-            "light,noise=8,light=0.7+noise=8.",
+            "light,noise=8,light=0.7+noise=8; ? is answered with all names.",
             "A,B|audit|all",
         ),
     ] = ()

@@ -37,7 +37,7 @@ from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_back, frames_of
 from hjepa_cli.core.plants.named import plant_of, seen_as_trained
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.core.statistics import bootstrap_weights, mean_interval
-from hjepa_cli.errors import NumericalError, Unavailable, UsageError
+from hjepa_cli.errors import DataError, NumericalError, Unavailable, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import results
 from hjepa_cli.stages.device import check_plant
@@ -252,6 +252,12 @@ def opened(
     bundle = open_bundle(model)
     check_plant(bundle, settings)
     path = zoo.resolve_model(checkpoint) if checkpoint else checkpoint_of(bundle)
+    if load_checkpoint(path).digest != bundle.manifest["checkpoint"]["sha256"]:
+        raise DataError(
+            f"{path} is not what {model} was exported from: a difference would be of models, not "
+            "of the wire",
+            hint=f"{shell(['hjepa', 'export', checkpoint or path])} --to DIR, and --model DIR here",
+        )
     recorded = None if trace is None else Trace.read(trace)
     protocol_ = settings.protocol
     late = {

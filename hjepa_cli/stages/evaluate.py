@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.config.checks import check_gaps, check_methods
-from hjepa_cli.config.schema import RECORDED, Settings
+from hjepa_cli.config.checks import changed, check_gaps, check_methods
+from hjepa_cli.config.schema import IDEAL_LINK, RECORDED, Settings
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import MissingInputError, UsageError, require
@@ -23,6 +23,9 @@ from hjepa_cli.stages.model_set import ModelSet, open_model_set
 from hjepa_cli.stages.plan import Plan, run_directory
 from hjepa_cli.stages.stressing import measure_stress, plan_stress, rows_of
 from hjepa_cli.storage.runs import Run
+
+# Settings of the protocol that recordings cannot follow.
+OF_LOOPS = [f"protocol.{key}" for key in (*IDEAL_LINK, "plant_spread", "process_noise")]
 
 
 def run(
@@ -61,7 +64,7 @@ def run(
     asked = Looks.of(title, labels, log)
     asked.check_drawn(figure, "hjepa eval --figure")
     if settings.plant == RECORDED:
-        refuse_closed_loop(remeasure=remeasure, figure=figure)
+        refuse_closed_loop(settings, remeasure=remeasure, figure=figure)
         found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}
         return evaluate_offline.run(settings, screen, **found)
     models = open_measurable(settings, screen, checkpoint, dataset, further, figure=figure)
@@ -103,7 +106,7 @@ def plan(
     """Plan the loops of the methods whose curves are not there yet; arguments as of :func:`run`."""
     Looks.of(labels=labels)
     if settings.plant == RECORDED:
-        refuse_closed_loop(remeasure=remeasure, figure=figure)
+        refuse_closed_loop(settings, remeasure=remeasure, figure=figure)
         found = {"checkpoint": checkpoint, "dataset": dataset, "out": out, "further": further}
         return evaluate_offline.plan(settings, **found)
     quiet = Screen(quiet=True)
@@ -122,14 +125,16 @@ def plan(
     )
 
 
-def refuse_closed_loop(**flags: bool) -> None:
-    """Raise UsageError for flags about closed loops, where there are recordings alone."""
-    for name, given in flags.items():
-        if given:
-            raise UsageError(
-                f"--{name} is about closed loops; a recorded plant has none",
-                hint="hjepa eval --dataset DIR, without it",
-            )
+def refuse_closed_loop(settings: Settings, **flags: bool) -> None:
+    """Raise UsageError for what is about closed loops, where there are recordings alone."""
+    given = [f"--{name}" for name, value in flags.items() if value]
+    given += [key for key in changed(settings.protocol, "protocol") if key in OF_LOOPS]
+    if given:
+        raise UsageError(
+            f"{given[0]} is about closed loops; a recorded plant has none",
+            hint="hjepa eval --dataset DIR, without it",
+            key=given[0] if given[0] in OF_LOOPS else None,
+        )
 
 
 def reads_of(models: ModelSet) -> list[str]:

@@ -185,6 +185,11 @@ def open_model_set(
     if model:
         if settings.plant == RECORDED and dataset:
             check_same_plant(model.metadata, settings, f"model {path}")
+        if (trained_by := model.metadata["settings"].get("preset")) != settings.preset:
+            screen.say(
+                f"model {path} was trained by preset {trained_by}: its recipe and law count, not "
+                f"those of preset {settings.preset}"
+            )
         settings = under_law_of(model, settings)
     data = open_dataset(dataset, settings) if dataset else None
     first = ModelSet(settings, model, path, data)

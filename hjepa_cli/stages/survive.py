@@ -133,7 +133,7 @@ def opened(
     refuse_recorded(settings, "survival is measured in closed loops")
     check_methods(settings.methods)
     parse_snr(settings.radio.snr_db)
-    check_cell(settings.radio, nr=settings.nr)
+    check_cell(settings.radio, nr=settings.nr, command="survive")
     if not settings.survival.intervals_steps:
         raise UsageError("no interval given; --intervals takes steps, as 10,40")
     protocol = settings.protocol

@@ -122,7 +122,15 @@ class Impairment:
     trace: Trace | None = None
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a loss that bursts with a good datagram in between cannot make."""
+        """Raise UsageError for what a trace replaces, and a loss that bursts cannot make.
+
+        There is a good datagram at least between two bursts.
+        """
+        replaced = ("loss", "delay_ms", "jitter_ms")
+        if self.trace is not None and (given := [*filter(vars(self).get, replaced)]):
+            raise UsageError(
+                f"a trace takes the place of {given[0].removesuffix('_ms')}; leave one of both out"
+            )
         most = self.burst / (1 + self.burst)
         if self.burst > 1 and self.loss > most:
             raise UsageError(

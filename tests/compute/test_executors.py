@@ -280,6 +280,10 @@ def test_places_that_are_not_there(hjepa: Shell, monkeypatch: pytest.MonkeyPatch
     assert_one_line_error(hjepa("collect", "--workers", "-1"), 2, "--workers")
     monkeypatch.setattr(executors, "CONNECT_S", 1)
     assert_one_line_error(hjepa("collect", "--quiet", "--cluster", "nonsense:1"), 2, "nonsense:1")
+    absent = hjepa("scale", "--snr", "20", "--quiet", "--cluster", "nosuch.json")  # all is cached
+    assert_one_line_error(absent, 2, "nosuch.json: no such file", "dask scheduler")
+    both = hjepa("collect", "--quiet", "--cluster", "local", "--workers", "0")
+    assert_one_line_error(both, 2, "--workers 0", "--cluster local")
     monkeypatch.setattr(executors.importlib.util, "find_spec", lambda _: None)
     missing = hjepa("collect", "--quiet", "--cluster", "local")
     assert_one_line_error(missing, 2, "needs Dask", 'pip install "hjepa[cluster]"')

@@ -292,6 +292,16 @@ def test_curves_of_a_baseline_are_complete_with_its_own_method(
     assert missing_curves(zoo.verify_model("raw")) == []
 
 
+def test_a_model_of_another_preset_is_said_to_be_one(tmp_path: Path, quick_encoder: None) -> None:
+    """Its recipe and law count, whatever the preset's are: results are not the preset's."""
+    shipped = untrained(tmp_path / "zoo" / "hierarchy" / "model.safetensors")
+    for preset, said in (("paper", True), (None, False)):
+        output = Output()
+        options = load_settings(preset, flags={"methods": ["hjepa"]})
+        open_model_set(options, output.screen, str(shipped), None)
+        assert ("trained by preset default" in output.stderr.getvalue()) is said
+
+
 def test_a_model_on_another_encoder_is_said_to_be_one(tmp_path: Path, quick_encoder: None) -> None:
     shipped = untrained(tmp_path / "zoo" / "hierarchy" / "model.safetensors")
     deeper, said = flat(5), "is on another encoder than"

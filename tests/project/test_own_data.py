@@ -62,6 +62,8 @@ def test_the_page_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
     for row, why in (("mass", "recordings have none"), ("lihgt", "did you mean 'light'")):
         assert_one_line_error(shell(*stressed, "--stress", row), 2, why)
     assert_one_line_error(shell(*stressed, "--false-alarm", "0.1"), 2, "simulated pictures")
+    late = (*stressed, "--delay-steps", "10", "--dry-run")
+    assert_one_line_error(shell(*late), 2, "--delay-steps is about closed loops")
 
     refused = shell("export", "runs/robot", "--to", "bundle", "--quiet")
     assert_one_line_error(refused, 2, "learned from recordings")

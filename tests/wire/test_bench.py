@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from hjepa_cli.config.settings import load_settings
-from hjepa_cli.errors import MissingInputError, UsageError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError
 from hjepa_cli.stages import bench_link
+from hjepa_cli.storage.checkpoints import load_checkpoint
+from hjepa_cli.storage.zoo import resolve_model
 from hjepa_cli.wire import bench
 
 MODEL = "desktop-h4m2l1"
@@ -85,7 +87,8 @@ def test_devices_that_drive_themselves_do_not_rush(monkeypatch, actor, ends_afte
 @pytest.fixture
 def without_export(monkeypatch):
     """An exported model of which nothing is asked."""
-    bundle = SimpleNamespace(frames=4, manifest={"checkpoint": {"sha256": "0" * 64}})
+    digest = load_checkpoint(resolve_model(MODEL)).digest
+    bundle = SimpleNamespace(frames=4, manifest={"checkpoint": {"sha256": digest}})
     monkeypatch.setattr(bench_link, "open_bundle", lambda path: bundle)
     monkeypatch.setattr(bench_link, "check_plant", lambda bundle, settings: None)
 
@@ -123,6 +126,12 @@ def test_a_trace_and_delays_are_two_links(without_export, tmp_path):
     options = load_settings(flags={"protocol.delay_steps": 3})
     with pytest.raises(UsageError, match="leave --delay-steps out"):
         bench_link.plan(options, checkpoint=MODEL, trace=tmp_path / "trace", lockstep=True)
+
+
+def test_the_wire_is_compared_with_what_was_exported(without_export):
+    with pytest.raises(DataError, match="gym-h4m2l1.* is not what exported was exported") as caught:
+        bench_link.plan(load_settings(), checkpoint="gym-h4m2l1")
+    assert "hjepa export gym-h4m2l1 --to" in caught.value.hint
 
 
 def test_a_plan_refuses_and_takes_time_as_the_drive_does(without_export, tmp_path):

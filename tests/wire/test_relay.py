@@ -53,6 +53,12 @@ def test_independent_losses_may_be_any_share_and_bursts_no_more_than_they_can_ma
     assert Impairment(loss=0.8, burst=4.0).loss == 0.8  # on the bound
 
 
+def test_a_trace_takes_the_place_of_losses_and_delays():
+    for given in ({"loss": 0.3}, {"delay_ms": 5.0}, {"jitter_ms": 1.0}):
+        with pytest.raises(UsageError, match="a trace takes the place of"):
+            Impairment(**given, trace=Trace((0.0,)))
+
+
 def test_delay_and_jitter():
     direction = Direction(Impairment(delay_ms=10, jitter_ms=6), 1, 0)
     taken = np.array([direction.passes_on(300, 1.0)[0] - 1.0 for _ in range(N)])

@@ -6,8 +6,7 @@ the sensor, what is sent. Controllers, teachers and the oracle's equations stay 
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.plants import corruptions
@@ -15,6 +14,7 @@ from hjepa_cli.core.plants.corruptions import Corrupt
 from hjepa_cli.errors import UsageError, choices
 
 AUDIT, ALL = "audit", "all"
+SETS = f", or {AUDIT} or {ALL}"  # beside the names, where several are asked for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,7 +189,7 @@ def rows(asked: Sequence[str], fits: Callable[[Condition], bool] = lambda one: T
             parse(text)
             found.append(text)
         else:
-            named = [*filter(fits, CONDITIONS.values())] if text == ALL else [_named(text)]
+            named = [_named(text, SETS)] if text != ALL else [*filter(fits, CONDITIONS.values())]
             found += [f"{one.name}={value:.4g}" for one in named for value in one.ladder]
     return list(dict.fromkeys(found))
 
@@ -249,17 +249,7 @@ def own_of(text: str) -> dict[Condition, float]:
     return parts
 
 
-def described(names: Iterable[str] = CONDITIONS) -> list[list[Any]]:
-    """Return a row for people of each condition: name, severities, bounds, help."""
-    chosen = (CONDITIONS[name] for name in names)
-    return [
-        [one.name, ", ".join(f"{v:.4g}" for v in one.ladder), one.low, one.high, one.help]
-        for one in chosen
-    ]
-
-
-def _named(name: str) -> Condition:
+def _named(name: str, sets: str = "") -> Condition:
     if name not in CONDITIONS:
-        known = choices(name, CONDITIONS)
-        raise UsageError(f"unknown condition '{name}'; {known}, or {AUDIT} or {ALL}")
+        raise UsageError(f"unknown condition '{name}'; {choices(name, CONDITIONS)}{sets}")
     return CONDITIONS[name]
