@@ -80,7 +80,7 @@ FLAT_SETTINGS = (  # all that the training of the flat baseline depends on
 )
 PICTURE_SETTINGS = ("precision", "shift_px", "light_spread", "camera_noise")  # of [encoder]
 PLANT = ("plant", "recorded", "camera")  # what an encoder must have in common with a dataset
-REFLEX = ("longest_age", "forces_at_once")  # of an encoder that comes with reflexes
+TRAINED_LATER = ("longest_age", "forces_at_once", "fusion")  # of train-reflex and train-fusion
 
 
 def run(
@@ -299,12 +299,17 @@ def describe_architecture(
     """
     hierarchy, begun = settings.hierarchy, begun or train_encoder.describe_architecture(settings)
     several = len({hierarchy.h, hierarchy.m, hierarchy.l}) > 1
-    return {key: value for key, value in begun.items() if key not in REFLEX} | {
+    return without_later(begun) | {
         "kind": "hierarchy" if several else "flat",
         **{name: getattr(hierarchy, name) for name in ("h", "m", "l")},
         "actor_hidden": settings.actor.hidden,
         "actor_dropout": settings.actor.dropout,
     }
+
+
+def without_later(architecture: dict[str, Any]) -> dict[str, Any]:
+    """Return an architecture without what later stages train beside it: others do not have it."""
+    return {key: value for key, value in architecture.items() if key not in TRAINED_LATER}
 
 
 @torch.inference_mode()

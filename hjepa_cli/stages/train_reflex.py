@@ -224,7 +224,8 @@ def describe_architecture(
 
     Without one it is that of the hierarchy that the settings train.
     """
-    return (begun or train_hierarchy.describe_architecture(settings)) | {
+    begun = begun or train_hierarchy.describe_architecture(settings)
+    return train_hierarchy.without_later(begun) | {
         "kind": "reflex",
         "longest_age": settings.protocol.gaps[-1],
         "forces_at_once": settings.reflex.forces_at_once,

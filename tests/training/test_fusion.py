@@ -13,12 +13,13 @@ from test_reflex import QUIET, prepare
 from test_reflex import settings as small
 
 from hjepa_cli.config.schema import Settings
-from hjepa_cli.core.control.drivers import methods_of
-from hjepa_cli.core.networks.model import Model, load_modules
+from hjepa_cli.core.control.drivers import methods_of, offered_methods
+from hjepa_cli.core.networks.model import Model, build_modules, load_modules
+from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.fusion_loops import listen
 from hjepa_cli.core.training.optimiser import Optimiser
 from hjepa_cli.errors import Interrupted
-from hjepa_cli.stages import resume, train_fusion
+from hjepa_cli.stages import resume, train_fusion, train_hierarchy, train_reflex
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
 FUSION = {
@@ -110,6 +111,15 @@ def test_only_the_posterior_is_trained(workplace: Path) -> None:
     model = Model.load(workplace / "run" / "model.safetensors", "cpu")
     assert "hjepa-fused" in methods_of(model) and "hjepa" in methods_of(model)
     assert "hjepa-fused" not in methods_of(Model.load(workplace / "model.safetensors", "cpu"))
+
+
+@pytest.mark.parametrize("stage", [train_hierarchy, train_reflex])
+def test_what_is_trained_on_a_fused_model_is_not_fused(workplace: Path, stage: Any) -> None:
+    fused = load_checkpoint(workplace / "run" / "model.safetensors").metadata["architecture"]
+    built = stage.describe_architecture(settings(), fused)
+    assert "posterior" in build_modules(fused) and "posterior" not in build_modules(built)
+    for architecture in (built, built | {"kind": "reflex", "fusion": True}):  # and what was saved
+        assert "hjepa-fused" not in offered_methods(architecture, plant("desktop"))
 
 
 @pytest.mark.parametrize("stop", [2, 5])  # in the first round and in the second

@@ -91,7 +91,9 @@ HJEPA_FUSED = predictor(
     "hjepa-fused",
     _hierarchy,
     fused=True,
-    offered=lambda architecture, plant: bool(architecture.get("fusion")),
+    offered=lambda architecture, plant: (
+        architecture["kind"] == "hierarchy" and bool(architecture.get("fusion"))
+    ),
     trained_by=training("train-fusion"),
     style=Style("#00366B", "H", ":", size=7.0),
     does="as hjepa, but a packet corrects what was predicted for its time",
