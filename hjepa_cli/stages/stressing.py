@@ -4,11 +4,12 @@ Models and settings → for every row (a condition with its severity) and method
 gaps between packets, by itself and ÷ the nominal one.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
 from hjepa_cli.config.checks import split_late
-from hjepa_cli.config.schema import RECORDED, Settings
+from hjepa_cli.config.schema import RECORDED, ConditionSettings, Settings
 from hjepa_cli.core.control.loop import Outcome, check_memory
 from hjepa_cli.core.evaluation import robustness
 from hjepa_cli.core.evaluation.bench import Bench
@@ -16,7 +17,7 @@ from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Pending, start_points
 from hjepa_cli.core.evaluation.workers import open_workers
 from hjepa_cli.core.plants import stress
-from hjepa_cli.core.plants.conditions import actual_camera
+from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.plants.stress import Condition
 from hjepa_cli.errors import UsageError
@@ -53,16 +54,27 @@ def rows_of(settings: Settings) -> dict[str, Settings]:
         UsageError: a condition that there is not, that the plant has not, or out of its bounds.
     """
     recorded, grey = settings.plant == RECORDED, settings.camera.grey
+    nominal = dataclasses.replace(settings, conditions=ConditionSettings())
 
     def fits(one: Condition) -> bool:
-        return not (recorded and one.apply is None) and not (grey and one.of_colours)
+        if recorded and one.apply is None or grey and one.of_colours:
+            return False
+        conditions = stress.under(nominal, f"{one.name}={one.ladder[0]:g}").conditions
+        try:
+            actual_plant(settings.plant, conditions)
+        except UsageError:  # it has no such part
+            return False
+        return True
 
     rows = {text: stress.under(settings, text) for text in stress.rows(settings.stress, fits)}
     for text, row in rows.items():
         moving = [one.name for one in stress.parse(text) if one.apply is None]
         if recorded and moving:
             raise UsageError(f"condition {moving[0]} is of plants or links; recordings have none")
-        actual_camera(row)
+        try:
+            actual_camera(row)
+        except UsageError as error:  # which may name a setting that nobody has set
+            raise UsageError(f"--stress {text}: {error.message}", hint=error.hint) from None
     return rows
 
 

@@ -79,11 +79,28 @@ def test_the_report_has_the_table_and_the_figure(evaluated, tmp_path) -> None:
     assert all(row in text for row in (*ROWS, "nominal", "mean of these", "<img"))
 
 
-@pytest.mark.parametrize("row", ["lihgt=0.5", "light=9", "viscous"])
-def test_what_cannot_be_measured_is_refused_before_anything_is_written(row, tmp_path) -> None:
-    preset, model = ("quadrotor", None) if row == "viscous" else ("smoke", "desktop-h4m2l1")
+@pytest.mark.parametrize(("preset", "counts"), [("default", (42, 116)), ("quadrotor", (37, 105))])
+def test_sets_of_conditions_are_those_that_the_plant_has(preset, counts) -> None:
+    every = [load_settings(preset, flags={"stress": (name,)}) for name in ("audit", "all")]
+    assert tuple(len(stressing.rows_of(settings)) for settings in every) == counts
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ("lihgt=0.5", "lihgt"),
+        ("light=9", "light=9"),
+        ("viscous", "--stress viscous=0.5: "),
+        ("length=0.9", "--stress length=0.9: "),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_anything_is_written(
+    row, says, tmp_path
+) -> None:
+    lacking = says.startswith("--stress")
+    preset, model = ("quadrotor", None) if lacking else ("smoke", "desktop-h4m2l1")
     settings = load_settings(preset, flags={"stress": (row,), "methods": ("oracle",)})
-    with pytest.raises(UsageError, match=row.partition("=")[0]):
+    with pytest.raises(UsageError, match=says):
         evaluate.run(settings, Screen(quiet=True), checkpoint=model, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
