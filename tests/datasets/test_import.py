@@ -400,6 +400,10 @@ def test_arrays_from_python(tmp_path, monkeypatch):
     limits = np.abs(3 * actions).max(axis=(0, 1))
     wanted = (3 * actions[[0, 1, 3]] / limits)[:, 1:].astype(np.float32)
     assert np.array_equal(data.split("train").applied_n, wanted)
+    ended = np.concatenate([3 * actions[:, :-1], np.full_like(actions[:, :1], np.nan)], axis=1)
+    ended = hjepa_cli.Dataset.from_arrays(frames, ended, size=size, out="whole")
+    most = np.abs(3 * actions[:, :-1]).max(axis=(0, 1))
+    np.testing.assert_allclose(ended.settings["recorded"]["limits"], most)
     ragged = hjepa_cli.Dataset.from_arrays(
         [frames[0], frames[1, :7]], [actions[0], actions[1, :6]], size=size, out="ragged"
     )

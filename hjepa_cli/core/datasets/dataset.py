@@ -19,6 +19,7 @@ import numpy as np
 
 from hjepa_cli.config.schema import RECORDED, CameraSettings, SensorSettings
 from hjepa_cli.core.datasets.importing import arrays as arrays_of
+from hjepa_cli.core.datasets.importing.aligned import largest
 from hjepa_cli.core.datasets.importing.assembly import Assembly
 from hjepa_cli.core.datasets.importing.prepared import Options, Prepared, prepare
 from hjepa_cli.core.plants.named import camera_in, plant_in
@@ -158,8 +159,7 @@ class Dataset:
         columns = {key: list(values) for key, values in given.items() if values is not None}
         recording = arrays_of.recording(list(frames), columns, format="arrays")
         if limits is None:
-            rows = np.concatenate([np.abs(rows).reshape(len(rows), -1) for rows in actions])
-            limits = np.where(rows.max(axis=0) > 0, rows.max(axis=0), 1.0).tolist()
+            limits = [float(most) or 1.0 for most in largest(recording)]
         camera = CameraSettings(*size, grey)
         options = Options(
             camera,

@@ -49,21 +49,21 @@ def limits_of(recording: Recording, limits: Sequence[float] | None) -> tuple[flo
         UsageError: nobody says what they are, or there are not as many as actions.
         DataError: no episode is sound.
     """
-    largest = _largest(recording)
+    most = largest(recording)
     if limits is None:
-        if recording.limits is not None and len(recording.limits) == len(largest):
+        if recording.limits is not None and len(recording.limits) == len(most):
             return recording.limits
-        shown = ",".join(f"{value:.4g}" for value in largest)
+        shown = ",".join(f"{value:.4g}" for value in most)
         raise UsageError(
-            f"nobody says what limits the {len(largest)} actions have; the largest recorded ones "
+            f"nobody says what limits the {len(most)} actions have; the largest recorded ones "
             f"are {shown}",
             hint=f"--limit {shown}, or a limit above: actions are stored divided by it",
         )
     if len(limits) == 1:
-        limits = [*limits] * len(largest)
-    if len(limits) != len(largest):
+        limits = [*limits] * len(most)
+    if len(limits) != len(most):
         raise UsageError(
-            f"--limit has {len(limits)} values; there are {len(largest)} actions",
+            f"--limit has {len(limits)} values; there are {len(most)} actions",
             hint="give one for all, or one for each",
         )
     return tuple(limits)
@@ -145,9 +145,13 @@ def align(
     return Aligned(episode, first, scaled, (expert[led] / limits).clip(-1, 1), recorded[first:stop])
 
 
-def _largest(recording: Recording) -> Floats:
-    """Return the largest of each action over all sound episodes."""
-    largest: Floats | None = None
+def largest(recording: Recording) -> Floats:
+    """Return the largest of each action over all sound episodes; rows that say none do not count.
+
+    Raises:
+        DataError: there is none.
+    """
+    found: Floats | None = None
     for _, read in recording.episodes:
         try:
             episode = read()
@@ -157,15 +161,15 @@ def _largest(recording: Recording) -> Floats:
         if not len(rows):
             continue
         most = rows.max(axis=0)
-        if largest is None:
-            largest = most
-        elif largest.shape == most.shape:
-            largest = np.maximum(largest, most)
-    if largest is None:
+        if found is None:
+            found = most
+        elif found.shape == most.shape:
+            found = np.maximum(found, most)
+    if found is None:
         if recording.episodes:
             recording.episodes[0][1]()  # which says what is wrong with it
         raise DataError("no episode has any action")
-    return largest
+    return found
 
 
 def _check_finite(name: str, what: str, values: Floats) -> None:
