@@ -144,6 +144,19 @@ def test_a_single_episode_is_held_out_at_its_end(shell, tmp_path):
     assert np.array_equal(test.frames[-1], frames[0, 33:40])
 
 
+@pytest.mark.parametrize(
+    ("share", "left"), [(0.2, "6 pictures to train on and 1 to"), (0.9, "1 pictures")]
+)
+@pytest.mark.parametrize("more", [(), ("--steps", 2)])
+def test_a_single_episode_too_short_to_hold_out_is_refused(share, left, more, shell, tmp_path):
+    frames, actions, _ = recordings.make(episodes=1, steps=7)
+    save(tmp_path / "r.npz", frames, actions)
+    with shell.untouched():
+        refused = shell("data", "import", "r.npz", *SAID, *more, "--held-out", share, "--out", "d")
+    assert_one_line_error(refused, 2, f"--held-out {share:g} leaves {left}", "--held-out 0.5")
+    assert shell("data", "import", "r.npz", *SAID, *more, "--held-out", 0.5, "--out", "d").code == 0
+
+
 def test_an_offset_moves_actions_to_the_frames_they_lead_from(shell, tmp_path):
     frames, actions, _ = recordings.make(episodes=3, steps=14)
     late = np.zeros_like(actions)

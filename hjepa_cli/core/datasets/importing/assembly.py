@@ -16,6 +16,7 @@ from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.storage.shards import Shard, cut
 
 SHARD_BYTES = 64 * 2**20  # of frames
+LEAST_STEPS = 2  # of a trajectory
 UNREADABLE = (OSError, ValueError, KeyError)  # of libraries that read pictures
 
 
@@ -159,9 +160,10 @@ def shared_steps(episodes: Sequence[Aligned], steps: int | None) -> int:
     longest = max(one.rows for one in episodes) - 1
     if steps is None:
         return min(one.rows for one in episodes) - 1
-    if not 2 <= steps <= longest:
+    if not LEAST_STEPS <= steps <= longest:
         raise UsageError(
-            f"--steps {steps}: trajectories of 2 to {longest} steps can be cut from these episodes"
+            f"--steps {steps}: trajectories of {LEAST_STEPS} to {longest} steps can be cut from "
+            "these episodes"
         )
     return steps
 
@@ -181,11 +183,22 @@ def pieces_of(episodes: Sequence[Aligned], steps: int) -> list[Piece]:
 
 
 def held_out(episodes: Sequence[Aligned], share: float) -> tuple[list[Aligned], list[Aligned]]:
-    """Return episodes to train on, and evenly spaced ones to test on; of a single one its end."""
+    """Return episodes to train on, and evenly spaced ones to test on; of a single one its end.
+
+    Raises:
+        UsageError: what it leaves of a single one is too short for a trajectory.
+    """
     count = len(episodes)
     if count == 1:
         (whole,) = episodes
-        rows = whole.rows - max(round(share * whole.rows), 1)
+        tested = max(round(share * whole.rows), 1)
+        rows = whole.rows - tested
+        if min(rows, tested) < LEAST_STEPS + 1:
+            raise UsageError(
+                f"{whole.episode.name}: --held-out {share:g} leaves {rows} pictures to train on "
+                f"and {tested} to test on; expected {LEAST_STEPS + 1} or more of each",
+                hint="--held-out 0.5, a longer episode, or --test SOURCE",
+            )
         return [whole.part(0, rows)], [whole.part(rows, whole.rows)]
     tests = min(max(round(share * count), 1), count - 1)
     chosen = {int((number + 0.5) * count / tests) for number in range(tests)}
