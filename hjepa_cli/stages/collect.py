@@ -37,13 +37,7 @@ from hjepa_cli.errors import DataError, HjepaError, Interrupted, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import PLANTS
 from hjepa_cli.stages.plan import Plan, seconds_of
-from hjepa_cli.storage.files import (
-    check_free_space,
-    holding,
-    identity,
-    point_to,
-    refuse_foreign,
-)
+from hjepa_cli.storage.files import holding, identity, point_to, refuse_foreign
 from hjepa_cli.storage.runs import continue_command, differences
 from hjepa_cli.storage.shards import (
     LOG,
@@ -51,6 +45,7 @@ from hjepa_cli.storage.shards import (
     Described,
     Shard,
     ShardLog,
+    check_room,
     cut,
     read_task,
     remove_log,
@@ -88,9 +83,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
         if (directory / MANIFEST).exists():
             return describe_finished(directory, screen, settings.plant, definition)
         check_same(directory, settings)
-        there = (path for path in directory.iterdir() if NAME.fullmatch(path.name))
-        there_bytes = sum(path.stat().st_size for path in there)
-        check_free_space(directory, size_bytes(settings) - there_bytes)
+        check_room(directory, size_bytes(settings))
         with telling_how_to_go_on(directory):
             log = ShardLog(directory, settings.as_dict())
             sample = generate(

@@ -36,9 +36,8 @@ from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.collect import telling_how_to_go_on
 from hjepa_cli.stages.plan import Plan
-from hjepa_cli.storage import files
 from hjepa_cli.storage.runs import continue_command
-from hjepa_cli.storage.shards import LOG, ShardLog, read_task, remove_log
+from hjepa_cli.storage.shards import LOG, ShardLog, check_room, read_task, remove_log
 
 TASK = "import"  # in the first line of the log of an unfinished import
 IMPORTED_FRAMES_PER_S = 3000.0
@@ -117,7 +116,7 @@ def import_recordings(
         begun = begun_with(task)
         if (directory / LOG).exists():
             check_same(directory, begun)
-        files.check_free_space(directory, size_bytes(prepared))
+        check_room(directory, size_bytes(prepared))
         with telling_how_to_go_on(directory), undone(directory, DataError, keep=existed):
             data = write(directory, prepared, definition, ShardLog(directory, begun), screen)
     result = describe(data, prepared, verdict, time.perf_counter() - started)
@@ -147,14 +146,15 @@ def write(
         )
         for shard in shards
     }
-    done = sum(frames[name] for name in log.done if name in frames)
-    for described in log.done.values():
-        made.bad += described.get("bad", [])
+    # Those with flaws are made again: all of an unsound episode is left out, in later shards too.
+    done = {name: described for name, described in log.done.items() if not described.get("bad")}
+    for described in done.values():
         made.said |= set(described.get("said", []))
-    with screen.progress("import", made.frames(), "frames", done=done) as bar:
-        for described in write_shards(directory, made, definition, log.done):
-            said = {"bad": list(made.bad), "said": sorted(made.said)}
-            log.add({**described, **said})
+    there, told = sum(frames[name] for name in done if name in frames), len(made.bad)
+    with screen.progress("import", made.frames(), "frames", done=there) as bar:
+        for described in write_shards(directory, made, definition, done):
+            log.add({**described, "bad": made.bad[told:], "said": sorted(made.said)})
+            told = len(made.bad)
             bar.advance(frames[described["name"]])
     data = write_recording(directory, [log.done[shard.name] for shard in shards], definition)
     remove_log(directory)

@@ -84,6 +84,12 @@ class ShardLog:
         self.done[described["name"]] = described
 
 
+def check_room(directory: Path, size_bytes: int) -> None:
+    """Raise StorageError if the disk cannot hold what a dataset of that size still lacks."""
+    there = (path for path in directory.iterdir() if NAME.fullmatch(path.name))
+    files.check_free_space(directory, size_bytes - sum(path.stat().st_size for path in there))
+
+
 def remove_log(directory: Path) -> None:
     """Delete the progress log once the manifest exists. Raises StorageError."""
     with files.writing(directory / LOG):

@@ -143,7 +143,7 @@ def test_a_log_left_beside_a_finished_dataset_goes(
 
 def test_room_is_needed_only_for_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
-    monkeypatch.setattr(collect, "check_free_space", lambda _, size_bytes: asked.append(size_bytes))
+    monkeypatch.setattr(files, "check_free_space", lambda _, size_bytes: asked.append(size_bytes))
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", failing(os.replace, KeyboardInterrupt(), datasets.MANIFEST))
         with pytest.raises(Interrupted):

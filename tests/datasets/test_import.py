@@ -14,10 +14,13 @@ import recordings
 from command_line import ENVIRONMENT, assert_one_line_error, open_shell
 
 import hjepa_cli
+from hjepa_cli.core.datasets.importing import assembly
 from hjepa_cli.core.plants.frames import frames_of
 from hjepa_cli.core.plants.resizing import area_means, fitted
 from hjepa_cli.stages import import_data
+from hjepa_cli.storage import files
 from hjepa_cli.storage.checkpoints import load_checkpoint
+from hjepa_cli.storage.shards import ShardLog
 
 SIZE = ("--size", recordings.H, recordings.W)
 SAID = ("--fps", 20, "--limit", 1, *SIZE)
@@ -377,6 +380,37 @@ def test_an_import_that_is_killed_goes_on_and_ends_in_the_same_bytes(tmp_path):
             assert (tmp_path / "whole" / name).read_bytes() == (
                 tmp_path / "again" / name
             ).read_bytes()
+
+
+@pytest.mark.parametrize("stop", [1, 2, 3, 5])
+def test_a_resumed_import_tells_each_flaw_once_and_asks_for_what_is_missing(
+    stop, shell, tmp_path, monkeypatch
+):
+    """Of episode 1 only the first of three trajectories shows the flaw; none is taken."""
+    frames, actions, _ = recordings.make(episodes=4, steps=10)
+    frames = (frames / 255).astype(np.float32)
+    frames[1, 1, 0, 0, 0] = np.nan
+    command = ("data", "import", save(tmp_path / "r.npz", frames, actions), *SAID, "--steps", 3)
+    command += ("--skip-bad", "--json", "--out")
+    monkeypatch.setattr(assembly, "SHARD_BYTES", 2 * 4 * recordings.H * recordings.W * 3)
+    whole, asked, add = shell(*command, "whole").document, [], ShardLog.add
+    assert len(whole["left_out"]) == 1 and whole["train_trajectories"] == 6
+
+    def stopping(log, described):
+        add(log, described)
+        if len(log.done) == stop:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ShardLog, "add", stopping)
+        assert shell(*command, "again").code == 130
+    there = sum(path.stat().st_size for path in (tmp_path / "again").glob("shard-*"))
+    monkeypatch.setattr(files, "check_free_space", lambda _, size_bytes: asked.append(size_bytes))
+    again = shell("resume", "again", "--json").document
+    assert again["left_out"] == whole["left_out"]
+    assert asked == [4 * 3 * 4 * recordings.H * recordings.W * 3 - there]
+    for path in (tmp_path / "whole").glob("[ds]*"):
+        assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes()
 
 
 def test_an_unfinished_import_is_planned_and_refuses_pictures_that_were_replaced(
