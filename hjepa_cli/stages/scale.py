@@ -32,7 +32,7 @@ from hjepa_cli.stages.measuring import plan_curves, seconds_of_loops
 from hjepa_cli.stages.plan import Plan, run_directory
 from hjepa_cli.stages.scale_by_formula import ByFormula, described
 from hjepa_cli.stages.scale_by_simulation import BySimulation
-from hjepa_cli.stages.scale_by_tolerance import ByTolerance
+from hjepa_cli.stages.scale_by_tolerance import ByTolerance, refuse_measuring
 from hjepa_cli.stages.verification import enforce
 from hjepa_cli.storage.files import write_text
 from hjepa_cli.storage.runs import Run
@@ -74,7 +74,7 @@ def run(
             run's is drawn again.
 
     Raises:
-        UsageError: bad SNR grid or method, or radio values that the law does not read.
+        UsageError: bad SNR grid or method, or what the law or ``tolerance_steps`` does not read.
         MissingInputError: no such checkpoint, or none with any of the methods.
         DataError: a damaged checkpoint, or one of another plant.
         NumericalError: ``verify`` does not confirm what was found.
@@ -82,7 +82,8 @@ def run(
     radio, kind = settings.radio, plant_of(settings)
     grid_db, asked = parse_snr(radio.snr_db), Looks.of(title, labels, log)
     check_cell(radio, {"remeasure": remeasure}, settings.nr)
-    count = counting(settings, screen, checkpoint, dataset, further, tolerance_steps)
+    inputs = (checkpoint, dataset, further, tolerance_steps)
+    count = counting(settings, screen, *inputs, remeasure=remeasure, verify=verify)
     given: dict[str, Any] = {"verify": verify, "tolerance_steps": tolerance_steps}
     if "remeasure" in LAWS[radio.law].uses:
         given["remeasure"] = remeasure
@@ -138,8 +139,8 @@ def plan(
     radio, protocol = settings.radio, settings.protocol
     grid_db = parse_snr(radio.snr_db)
     check_cell(radio, {"remeasure": remeasure}, settings.nr)
-    quiet = Screen(quiet=True)
-    count = counting(settings, quiet, checkpoint, dataset, further, tolerance_steps)
+    inputs = (checkpoint, dataset, further, tolerance_steps)
+    count = counting(settings, Screen(quiet=True), *inputs, remeasure=remeasure, verify=verify)
     if isinstance(count, BySimulation):
         reads = [f"model {count.models.name}"]
         work, seconds = plan_searches(settings, count.methods, verify=verify)
@@ -193,6 +194,9 @@ def counting(
     dataset: Path | None = None,
     further: Sequence[Path] | None = None,
     tolerance_steps: float | None = None,
+    *,
+    remeasure: bool = False,
+    verify: bool = False,
 ) -> ByFormula | BySimulation:
     """Open what is to be counted under the law of the settings; arguments as of :func:`run`."""
     law, radio = LAWS[settings.radio.law], settings.radio
@@ -202,6 +206,10 @@ def counting(
                 f"--tolerance-steps is for a law with a formula; {settings.radio.law} simulates",
                 hint="hjepa scale --law duty --tolerance-steps STEPS",
             )
+        refuse_measuring(
+            settings,
+            {"--verify": verify, "--remeasure": remeasure, "--dataset": dataset, "further": further},
+        )
         return ByTolerance(law, settings, screen, tolerance_steps, checkpoint)
     if settings.plant == RECORDED:
         raise UsageError(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control import link
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant_of
@@ -25,11 +26,22 @@ from hjepa_cli.storage import zoo
 from hjepa_cli.storage.runs import Run
 
 
+def refuse_measuring(settings: Settings, given: Mapping[str, object]) -> None:
+    """Raise UsageError for methods, or what else is ``given`` by its flag, to measure with."""
+    own = settings.methods != load_settings(settings.preset).methods
+    if asked := [*["--methods"] * own, *(flag for flag, value in given.items() if value)]:
+        raise UsageError(
+            f"{asked[0]} is of what is measured; with --tolerance-steps nothing is",
+            hint=f"leave out {asked[0]}, or --tolerance-steps to measure",
+            key="methods" if own else None,
+        )
+
+
 class ByTolerance(ByFormula):
     """Counts devices whose packets come a stated number of steps apart; the model says their bits.
 
     Raises:
-        UsageError: a gap of less than a step, or methods, which nothing is measured of.
+        UsageError: a gap of less than a step.
     """
 
     def __init__(

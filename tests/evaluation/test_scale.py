@@ -5,6 +5,7 @@ import io
 import json
 import math
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -128,6 +129,23 @@ def test_a_stated_gap_is_charged_as_the_protocol_starts(tmp_path, monkeypatch, s
     c, steps = 20e6 * 1e-3 * math.log2(101) / 2064, settings.protocol.steps
     extra = 0 if start == "steady" else 1 - 1 / 320
     assert row["devices"] == math.floor(c * steps / (steps / 320 + extra))
+
+
+@pytest.mark.parametrize(
+    ("named", "given"),
+    [
+        ("--verify", {"verify": True}),
+        ("--remeasure", {"remeasure": True}),
+        ("--dataset", {"dataset": Path("data")}),
+        ("further", {"further": [Path("model")]}),
+        ("--methods", {}),
+    ],
+)
+def test_what_measures_is_refused_beside_a_stated_gap(named, given):
+    settings = load_settings(flags={"methods": ("hold",)} if named == "--methods" else {})
+    for function, more in ((scale.run, {"screen": Screen(True)}), (scale.plan, {})):
+        with pytest.raises(UsageError, match=f"{named} is of what is measured"):
+            function(settings, **more, **given, tolerance_steps=8)
 
 
 def test_gains_stand_beside_the_papers(stage):
