@@ -206,10 +206,8 @@ def counting(
                 f"--tolerance-steps is for a law with a formula; {settings.radio.law} simulates",
                 hint="hjepa scale --law duty --tolerance-steps STEPS",
             )
-        refuse_measuring(
-            settings,
-            {"--verify": verify, "--remeasure": remeasure, "--dataset": dataset, "further": further},
-        )
+        asked = {"--verify": verify, "--remeasure": remeasure, "--dataset": dataset}
+        refuse_measuring(settings, asked | {"further": further})
         return ByTolerance(law, settings, screen, tolerance_steps, checkpoint)
     if settings.plant == RECORDED:
         raise UsageError(

@@ -144,9 +144,10 @@ def opened(
                 "steps after a silence; expected no more",
                 hint=f"--intervals {min(watched, 10)}",
             )
-    longest = Trial.of(protocol, max(settings.survival.intervals_steps)).steps(protocol.gaps[-1])
+    trial = Trial.of(protocol, max(settings.survival.intervals_steps))
+    longest = trial.steps(longest_gap(settings))
     lived = dataclasses.replace(protocol, warmup_steps=0, steps=longest)
-    check_memory(lived, settings.survival.loops)
+    check_memory(lived, max(settings.survival.loops, settings.survival.splitting_paths))
     linked = [name for name in settings.methods if METHODS[split_late(name)[0]].needs_link]
     models = open_model_set(settings, screen, checkpoint, None, further)
     methods = models.measurable(linked)
@@ -253,10 +254,8 @@ class Survivals:
         for _ in range(ROUNDS + MOST_LONGER):
             outcomes |= self._silences(method, trial, wanted)
             curve = counted(outcomes)
-            longest = int(curve.gaps[-1])
             if curve.probability[-1] <= survival.LEVELS[0]:
-                limit = self._settings.protocol.gaps[-1] * LONGER**MOST_LONGER
-                wanted = [round(longest * LONGER)] if longest < limit else []
+                wanted = longer_gap(self._settings, int(curve.gaps[-1]))
             else:
                 wanted = [
                     gap for gap in curve.wanted(survival.LEVELS, WIDTH) if gap not in outcomes
@@ -315,6 +314,23 @@ class Survivals:
 def gaps_at_first(settings: Settings, interval: int) -> list[int]:
     """Return the gaps to begin with: none at all, and the protocol's that are longer."""
     return [interval, *(gap for gap in settings.protocol.gaps if gap > interval)]
+
+
+def longer_gap(settings: Settings, gap: int) -> list[int]:
+    """Return the gap to go on with where none so far loses enough loops; none if long enough."""
+    limit = settings.protocol.gaps[-1] * LONGER**MOST_LONGER
+    return [round(gap * LONGER)] if gap < limit else []
+
+
+def longest_gap(settings: Settings) -> int:
+    """Return the longest gap of loops that are never lost, which memory must hold."""
+    found = []
+    for interval in settings.survival.intervals_steps:
+        wanted = gaps_at_first(settings, interval)
+        while wanted:
+            found.append(wanted[-1])
+            wanted = longer_gap(settings, wanted[-1])
+    return max(found)
 
 
 def counted(outcomes: Mapping[int, Silences]) -> LossCurve:

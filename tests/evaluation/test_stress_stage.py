@@ -94,9 +94,7 @@ def test_sets_of_conditions_are_those_that_the_plant_has(preset, counts) -> None
         ("length=0.9", "--stress length=0.9: "),
     ],
 )
-def test_what_cannot_be_measured_is_refused_before_anything_is_written(
-    row, says, tmp_path
-) -> None:
+def test_what_cannot_be_measured_is_refused_before_anything_is_written(row, says, tmp_path) -> None:
     lacking = says.startswith("--stress")
     preset, model = ("quadrotor", None) if lacking else ("smoke", "desktop-h4m2l1")
     settings = load_settings(preset, flags={"stress": (row,), "methods": ("oracle",)})

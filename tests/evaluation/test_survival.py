@@ -251,3 +251,20 @@ def test_loops_that_no_memory_holds_are_refused_before_any_is_drawn():
     flags = SETTINGS | {"survival.loops": 10**8}
     with pytest.raises(OutOfMemory, match="a loop of 100000000 devices over"):
         survive.opened(load_settings(flags=flags), Screen(quiet=True), None, None)
+
+
+@pytest.mark.parametrize(("loops", "paths"), [(24, 0), (8, 96)])
+def test_memory_is_that_of_the_longest_loops(loops, paths, monkeypatch):
+    """Loops that no gap loses are driven on: 5, 8, 12 and 18 steps, beyond 5 · 1.5³."""
+    asked = []
+
+    def check(protocol, devices):
+        asked.append((protocol.total_steps, devices))
+        raise OutOfMemory("no")
+
+    monkeypatch.setattr(survive, "check_memory", check)
+    flags = {"protocol.gaps": (1, 5), "survival.intervals_steps": (3, 4), "survival.loops": loops}
+    settings = load_settings(flags=SETTINGS | flags | {"survival.splitting_paths": paths})
+    with pytest.raises(OutOfMemory):
+        survive.opened(settings, Screen(quiet=True), None, None)
+    assert asked == [(150 + 18 + 300, max(loops, paths))]
