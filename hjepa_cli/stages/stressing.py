@@ -57,11 +57,11 @@ def rows_of(settings: Settings) -> dict[str, Settings]:
     nominal = dataclasses.replace(settings, conditions=ConditionSettings())
 
     def fits(one: Condition) -> bool:
-        if recorded and one.apply is None or grey and one.of_colours:
+        if (recorded and one.apply is None) or (grey and one.of_colours):
             return False
-        conditions = stress.under(nominal, f"{one.name}={one.ladder[0]:g}").conditions
+        worse = stress.under(nominal, stress.written({one: one.ladder[0]}))
         try:
-            actual_plant(settings.plant, conditions)
+            actual_plant(worse.plant, worse.conditions)
         except UsageError:  # it has no such part
             return False
         return True
