@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import ConditionSettings, EncoderSettings, Settings
 from hjepa_cli.core.arrays import Floats, Pixels
-from hjepa_cli.core.plants import stress
+from hjepa_cli.core.plants import corruptions, stress
 from hjepa_cli.core.plants.corruptions import as_bytes
 from hjepa_cli.core.plants.frames import FRAME_SHAPE
 from hjepa_cli.core.plants.named import camera_of, plant
@@ -128,14 +128,6 @@ class Disturbed:
         return self._camera.sketch_px(state)
 
 
-def disturbed(frames: Pixels, light: float, noise: float, random: np.random.Generator) -> Pixels:
-    """Return ``frames`` of any shape with all values × ``light`` and white noise added, clipped."""
-    values = np.float32(light) * frames.astype(np.float32)
-    if noise:
-        values += np.float32(noise) * random.standard_normal(values.shape, np.float32)
-    return as_bytes(values)
-
-
 def vary(frames: Pixels, encoder: EncoderSettings, seed: int, split: str) -> Pixels:
     """Return pictures [N, T, H, W, 3], each trajectory in a light and noise of its own.
 
@@ -149,5 +141,8 @@ def vary(frames: Pixels, encoder: EncoderSettings, seed: int, split: str) -> Pix
     varied = np.empty_like(frames)
     for before, after in zip(frames, varied, strict=True):
         light, noise = 1 + spread * random.uniform(-1, 1), most * random.uniform()
-        after[:] = disturbed(before, light, noise, random)
+        pictures = corruptions.light(before.astype(np.float32), light, random)
+        if noise:  # of width 0 it would be drawn all the same, and later trajectories be others
+            pictures = corruptions.noise(pictures, noise, random)
+        after[:] = as_bytes(pictures)
     return varied
