@@ -419,6 +419,8 @@ def test_seeds_are_averaged():
     half = 12.7062047 * math.sqrt(50) / math.sqrt(2)  # Student's t, one degree of freedom
     assert both.interval == pytest.approx((95 - half, 95 + half))
     assert combine(found[:1]) is found[0]
+    loads = [load for load, _ in both.points]
+    assert loads == sorted(loads) and len(loads) == sum(len(one.points) for one in found)
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
         at_least=any(one.at_least for one in found),
         packets_per_slot=float(np.mean([one.packets_per_slot for one in found])),
         reports_per_slot=float(np.mean([one.reports_per_slot for one in found])),
-        points=tuple(point for one in found for point in one.points),
+        points=tuple(sorted(point for one in found for point in one.points)),
         parts=tuple(found),
     )
 
