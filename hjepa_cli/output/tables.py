@@ -14,6 +14,15 @@ def measured(value: float | None) -> str:
     return "undefined" if value is None else f"{value:.3f}"
 
 
+def ranked(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Mapping[str, Any]]]]:
+    """Return device counts by method, with its scheduler where it has one, the most first."""
+    by_method: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        names = (row["method"], row.get("scheduler"))
+        by_method.setdefault(", ".join(filter(None, names)), []).append(row)
+    return sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
+
+
 def show_gates(screen: Screen, gates: dict[str, dict[str, Any]], *, enforced: bool) -> None:
     """Print a row per gate."""
     rows = [

@@ -111,10 +111,11 @@ def plan(
         return evaluate_offline.plan(settings, **found)
     quiet = Screen(quiet=True)
     models = open_measurable(settings, quiet, checkpoint, dataset, further, figure=figure)
-    measured = models.measurable(settings.methods)
-    work, seconds = plan_curves(models, measured, remeasure=remeasure)
     if settings.stress:
         work, seconds = plan_stress(models)
+    else:
+        measured = models.measurable(settings.methods)
+        work, seconds = plan_curves(models, measured, remeasure=remeasure)
     return Plan(
         command="eval",
         reads=reads_of(models),

@@ -23,6 +23,7 @@ from hjepa_cli.output.screen import Screen, can_draw, described_steps, in_order,
 from hjepa_cli.output.tables import (
     offline_columns,
     offline_rows,
+    ranked,
     stress_columns,
     stress_rows,
 )
@@ -270,15 +271,6 @@ def windows(errors: Mapping[str, Any]) -> list[str]:
     """Return headings for errors by method and window of steps."""
     first = next(iter(errors.values()))
     return [f"{window} steps" for window in first.get("nmae_windows", first)]
-
-
-def ranked(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Mapping[str, Any]]]]:
-    """Return device counts by method, with its scheduler where it has one, the most first."""
-    by_method: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        names = (row["method"], row.get("scheduler"))
-        by_method.setdefault(", ".join(filter(None, names)), []).append(row)
-    return sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
 
 
 def training_figures(result: Result, config: Mapping[str, Any], run: Path, asked: Looks) -> Figures:

@@ -19,6 +19,7 @@ from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.output.screen import Screen, described_steps, percent, span
+from hjepa_cli.output.tables import ranked
 from hjepa_cli.plugins import LAWS, METHODS, PHYS
 from hjepa_cli.stages.evaluate import open_measurable
 from hjepa_cli.stages.measuring import curves_for, measure_points
@@ -93,13 +94,10 @@ class ByFormula:
     def show(self, result: Mapping[str, Any]) -> None:
         """Print what a loop needs, how many fit, the gains beside the paper's."""
         screen, axis = self._screen, self._law.axis
-        by_method: dict[str, list[Row]] = {}
-        for row in result["rows"]:
-            by_method.setdefault(row["method"], []).append(row)
-        ranked = sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
+        counts = ranked(result["rows"])
         loops = {
             f"{method}, {delay} steps late" if (delay := row.get("delay_steps", 0)) else method: row
-            for method, rows in ranked
+            for method, rows in counts
             for row in reversed(rows)
         }
         screen.table(
@@ -118,8 +116,8 @@ class ByFormula:
         )
         screen.table(
             f"devices: {described(result)}; 95 % CI",
-            ["method", *(f"{row['snr_db']:g} dB" for row in ranked[0][1])],
-            [[method, *(_span(row, "devices", 0, "≥") for row in rows)] for method, rows in ranked],
+            ["method", *(f"{row['snr_db']:g} dB" for row in counts[0][1])],
+            [[method, *(_span(row, "devices", 0, "≥") for row in rows)] for method, rows in counts],
         )
         title, at = "driven now, inside and outside each tolerance", (axis.point, axis.point_label)
         show_verdicts(result, screen, title, "method", *at, axis.digits)
@@ -131,7 +129,7 @@ class ByFormula:
                 f"(95 % CI {' to '.join(percent(end) for end in found['ratio_ci95'])})"
                 + (paper if found["over"] == "ts-jepa-1" else "")
             )
-        for method, (row, *_) in ranked:
+        for method, (row, *_) in counts:
             if row["reason"]:
                 screen.say(f"{method} at {row['snr_db']:g} dB: {row['reason']}")
         screen.say(result["source"])

@@ -292,7 +292,7 @@ def make_link(
 def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
     """Fit a linear probe from embeddings to states, on trajectories made from the seed."""
     count = min(PROBE_TRAJECTORIES, settings.collect.trajectories)
-    recorded = generate(settings, "train")[:count]
+    recorded = generate(settings, "train", range(count))
     camera = model.camera
     embeddings, states = [], []
     with screen.progress("fit probe", count, "trajectories") as bar:

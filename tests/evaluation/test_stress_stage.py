@@ -52,6 +52,12 @@ def test_a_row_is_a_simulation_under_its_conditions(evaluated) -> None:
     np.testing.assert_allclose([mean["relative"] for mean in means], expected, atol=1e-12)
 
 
+def test_no_curves_are_planned_where_rows_are_measured(monkeypatch) -> None:
+    monkeypatch.setattr(evaluate, "plan_curves", lambda *_, **__: pytest.fail("curves"))
+    planned = evaluate.plan(options(*ROWS), checkpoint="desktop-h4m2l1")
+    assert "under 2 conditions and none" in planned.work[0]
+
+
 def test_rows_that_were_measured_are_not_measured_again(evaluated, tmp_path, monkeypatch) -> None:
     _, result = evaluated
     settings, quiet = options(*ROWS), Screen(quiet=True)

@@ -14,9 +14,12 @@ from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.controllers import LastForce, StrideController
 from hjepa_cli.core.control.loop import Draws, LinkDraws, every_step, simulate
 from hjepa_cli.core.control.methods.true_state import true_state_driver
+from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant
+from hjepa_cli.output.screen import Screen
+from hjepa_cli.stages import view
 from hjepa_cli.stages.view import Believer, Film, Link, make_link
 
 image_module = pytest.importorskip("PIL.Image")
@@ -70,6 +73,21 @@ def test_belief_is_the_step_that_a_counting_planner_has_reached():
         believer.act(delivered, received)
         np.testing.assert_allclose(believer.believed[-1][:, 0], expected)
         expected += 1
+
+
+def test_a_probe_simulates_no_more_than_it_sees(checkpoint, monkeypatch):
+    simulated = []
+
+    def counting(*given):
+        simulated.append(generate(*given))
+        return simulated[-1]
+
+    monkeypatch.setattr(view, "generate", counting)
+    monkeypatch.setattr(view, "PROBE_TRAJECTORIES", 2)
+    settings = load_settings(flags={"collect.trajectories": 3, "collect.steps": 9})
+    view.fit_probe(settings, Model.load(checkpoint), Screen(quiet=True))
+    [recorded] = simulated
+    assert len(recorded) == 2
 
 
 def test_a_probe_reads_what_embeddings_hold_linearly():
