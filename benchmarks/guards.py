@@ -92,7 +92,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         (FILES, "if free_bytes < size_bytes:", "if False:"),
     ),
     "test_collecting.py::test_room_is_needed_only_for_what_is_missing": (
-        (COLLECT, "size_bytes(settings) - there_bytes", "size_bytes(settings)"),
+        (SHARDS, "size_bytes - sum(path.stat().st_size for path in there)", "size_bytes"),
     ),
     "test_files.py::test_order_is_data_then_rename_then_directory": (
         (FILES, "                _sync(file.fileno())\n            _check_held", "            _check_held"),
@@ -153,6 +153,9 @@ GUARDS: dict[str, tuple[Change, ...]] = {
     ),
     "test_collecting.py::test_a_log_that_describes_other_shards_is_not_believed": (
         (COLLECT, "return ours.items() <= log.done.get(shard.name, {}).items()", "return shard.name in log.done"),
+    ),
+    "test_import.py::test_a_resumed_import_tells_each_flaw_once_and_asks_for_what_is_missing": (
+        ("stages/import_data.py", 'for name, described in log.done.items() if not described.get("bad")}', "for name, described in log.done.items()}"),
     ),
     # 12 – 17: arrays, modes, values, names, sizes
     "test_checkpoints.py::test_any_memory_layout_round_trips": (
@@ -526,7 +529,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         ("output/figures.py", '_wanted = os.environ.pop("MPLBACKEND", None)', "_wanted = None"),
     ),
     "test_small_things.py::test_a_hall_that_covers_few_says_so": (
-        ("stages/scale_by_simulation.py", "        if covered:\n            shares", "        if False:\n            shares"),
+        ("stages/scale_by_simulation.py", "        if covered:\n            ends", "        if False:\n            ends"),
     ),
     "test_familiarity.py::test_garbage_is_flagged_and_ordinary_packets_are_not": (
         ("core/control/familiarity.py", "flagged = self._familiarity.strange(packets) | same", "flagged = same"),

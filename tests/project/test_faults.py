@@ -35,6 +35,7 @@
 | 11 | shard that merely exists | test_executors.py::test_an_interrupted_collection_keeps_its_shards |
 | 11 | log of shards without a first line | test_collecting.py::test_a_log_has_its_first_line_or_is_not_there |
 | 11 | shards of another division | test_collecting.py::test_a_log_that_describes_other_shards_is_not_believed |
+| 11 | episodes left out before a stop, and taken after it | test_import.py::test_a_resumed_import_tells_each_flaw_once_and_asks_for_what_is_missing |
 | 12 | arrays that are not contiguous | test_checkpoints.py::test_any_memory_layout_round_trips |
 | 13 | file mode against the umask | test_files.py::test_mode_follows_the_umask |
 | 14 | loss or gradient not finite | test_resume.py::test_a_diverging_run_saves_nothing_that_is_not_finite |
