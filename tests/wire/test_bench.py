@@ -129,7 +129,9 @@ def test_a_trace_and_delays_are_two_links(without_export, tmp_path):
 
 
 def test_the_wire_is_compared_with_what_was_exported(without_export):
-    with pytest.raises(DataError, match="gym-h4m2l1.* is not what exported was exported") as caught:
+    with pytest.raises(
+        DataError, match=r"gym-h4m2l1.* is not what exported was exported"
+    ) as caught:
         bench_link.plan(load_settings(), checkpoint="gym-h4m2l1")
     assert "hjepa export gym-h4m2l1 --to" in caught.value.hint
 
