@@ -315,9 +315,6 @@ class Controller:
     ) -> Outgoing:
         """Take a datagram of a session; what is old, doubled or foreign changes nothing."""
         session = self.sessions.get(device)
-        if session is not None and not session.allowance.take(now_s):
-            self.counts["limited"] += 1
-            return []
         if session is None or not auth.is_tagged(session.key, data):
             session = self._pending.get(device)
             if session is None or not auth.is_tagged(session.key, data):
@@ -345,6 +342,9 @@ class Controller:
         verdict = session.replies.judge(message.step)
         if verdict != "new" or message.capture <= session.newest:
             self.counts["late" if verdict == "late" else "doubled"] += 1
+            return []
+        if not session.allowance.take(now_s):  # last, or strangers could spend a device's own
+            self.counts["limited"] += 1
             return []
         self.counts["embeddings"] += 1
         session.address, session.heard_s = address, now_s

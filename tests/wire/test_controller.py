@@ -298,6 +298,27 @@ def test_one_device_cannot_take_more_than_its_allowance():
     assert server.counts["limited"] >= 900
 
 
+def test_who_has_no_key_spends_no_device_s_allowance():
+    """Forged tags and recordings come by the hundred for each true embedding, all in one moment."""
+    server, one, sent, _ = ready()
+    z = np.ones(linear.SIZE, np.float32)
+
+    def flood(now_s):
+        for _ in range(200):
+            server.receive(b"HJ\x01\x03" + one.number.to_bytes(4, "little") + bytes(16), 2, now_s)
+            server.receive(sent, 2, now_s)
+
+    for step in range(1, 51):
+        flood(step * linear.PERIOD_S)
+        server.receive(one.embed(step, z), 1, step * linear.PERIOD_S)
+    assert server.counts["embeddings"] == 51 and not server.counts["limited"]
+    again = linear.device(one.number)
+    linear.connect(server, again, now_s=0.6)
+    flood(0.6)
+    server.receive(again.embed(0, z), "new", 0.6)
+    assert server.sessions[one.number].address == "new"
+
+
 def test_behind_schedule_it_skips_what_is_past():
     server, *_ = ready()
     planned, before = server.sessions[1].planned, server.counts["strides"]
