@@ -16,7 +16,7 @@ import heapq
 import itertools
 import secrets
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,8 @@ FADED_STEPS = 512  # since its newest embedding: then a device is served after a
 CLOCK_DATAGRAMS = 16  # of whose arrivals the earliest tells how late the others are
 GREETING = (200.0, 400.0)  # hellos a second of all strangers, and at once
 ALLOWANCE = (1.5, 32.0)  # datagrams per control step of a device, and at once
-PENDING = 4096  # sessions that have not been proved yet
+PENDING = 1024  # devices with sessions that have not been proved yet
+TRIES = 4  # such sessions of one device: the newest ones, of which one that proves itself stays
 NONCES = 8192  # of the newest hellos: one that comes again is a recording
 
 Address = Any
@@ -223,7 +224,7 @@ class Controller:
         self.bundle, self._runtime, self._key = bundle, runtime, key
         self._most, self._timeout_s, self._random = most_devices, timeout_s, random
         self.sessions: dict[int, Session] = {}
-        self._pending: collections.OrderedDict[int, Session] = collections.OrderedDict()
+        self._pending: collections.OrderedDict[int, deque[Session]] = collections.OrderedDict()
         self._greeting = Bucket(*GREETING)
         self._nonces: collections.OrderedDict[bytes, None] = collections.OrderedDict()
         self._fresh: dict[int, Session] = {}
@@ -301,9 +302,9 @@ class Controller:
         server_nonce = self._random()
         if reason == protocol.WELCOME:
             key = auth.session_key(self._key, hello.device, hello.nonce, server_nonce)
-            self._pending.pop(hello.device, None)
-            session = Session(hello, key, address, now_s, self.bundle.stride)
-            self._pending[hello.device] = session
+            tries = self._pending.setdefault(hello.device, deque(maxlen=TRIES))
+            tries.appendleft(Session(hello, key, address, now_s, self.bundle.stride))
+            self._pending.move_to_end(hello.device)
             while len(self._pending) > PENDING:
                 self._pending.popitem(last=False)
         else:
@@ -314,12 +315,10 @@ class Controller:
         self, kind: int, device: int, data: bytes, address: Address, now_s: float
     ) -> Outgoing:
         """Take a datagram of a session; what is old, doubled or foreign changes nothing."""
-        session = self.sessions.get(device)
-        if session is None or not auth.is_tagged(session.key, data):
-            session = self._pending.get(device)
-            if session is None or not auth.is_tagged(session.key, data):
-                self.counts["foreign" if device not in self.sessions else "forged"] += 1
-                return []
+        session = self._session_of(device, data)
+        if session is None:
+            self.counts["foreign" if device not in self.sessions else "forged"] += 1
+            return []
         message = protocol.parse(data)
         if isinstance(message, protocol.Bye):
             self._forget(device)
@@ -333,11 +332,12 @@ class Controller:
         ):
             self.counts["malformed"] += 1
             return []
-        if device in self._pending and session is self._pending[device]:
+        if session is not self.sessions.get(device):
             if device not in self.sessions and len(self.sessions) >= self._most:
                 self.counts["refused"] += 1
                 return []
-            self.sessions[device] = self._pending.pop(device)
+            self.sessions[device] = session
+            del self._pending[device]
             self.counts["sessions"] += 1
         verdict = session.replies.judge(message.step)
         if verdict != "new" or message.capture <= session.newest:
@@ -354,6 +354,14 @@ class Controller:
         session.fresh = message, late
         self._fresh[device] = session
         return []
+
+    def _session_of(self, device: int, data: bytes) -> Session | None:
+        """Return the session whose key a datagram is tagged with, be it proved yet or not."""
+        tries: Iterable[Session] = self._pending.get(device, ())
+        for one in (self.sessions.get(device), *tries):
+            if one is not None and auth.is_tagged(one.key, data):
+                return one
+        return None
 
     def _forget(self, device: int) -> None:
         self.sessions.pop(device, None)
@@ -386,9 +394,9 @@ class Controller:
                 self.counts["timeouts"] += 1
                 self.say(f"device {device} has been silent for {self._timeout_s:g} s: forgotten")
                 self._forget(device)
-        while self._pending:  # in the order in which they came
-            device, session = next(iter(self._pending.items()))
-            if now_s - session.heard_s <= self._timeout_s:
+        while self._pending:  # in the order of their newest hellos
+            device, tries = next(iter(self._pending.items()))
+            if now_s - tries[0].heard_s <= self._timeout_s:
                 break
             del self._pending[device]
 

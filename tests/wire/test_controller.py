@@ -191,6 +191,19 @@ def test_a_hello_alone_takes_nobodys_place():
     assert server.sessions[1] is not before and server.sessions[1].address == "new"
 
 
+def test_recorded_hellos_do_not_end_a_handshake_under_way():
+    """A server that has started anew knows no recording; the device's own hello is still good."""
+    recorded = [linear.device(1).upkeep(0.0) for _ in range(2 * controllers.TRIES)]
+    server, one = linear.controller(), linear.device(1)
+    for hello in recorded[: controllers.TRIES]:
+        server.receive(hello, "thief", 0.0)
+    linear.connect(server, one)
+    for hello in recorded[controllers.TRIES + 1 :]:
+        server.receive(hello, "thief", 0.0)
+    server.receive(one.embed(0, np.ones(linear.SIZE, np.float32)), 1, 0.0)
+    assert server.sessions[1].address == 1 and not server._pending
+
+
 def test_another_key_another_model_another_version_and_no_place():
     server = linear.controller(most_devices=1)
     wrong = Device(linear.bundle(), 1, bytes(32), 0.01)
@@ -342,6 +355,10 @@ def test_silent_devices_are_forgotten_and_memory_is_bounded():
         stranger = linear.device(number)
         server.receive(stranger.upkeep(now_s), number, now_s)
     assert len(server._pending) <= controllers.PENDING
+    for _ in range(3 * controllers.TRIES):
+        now_s += 0.1
+        server.receive(linear.device(number).upkeep(now_s), number, now_s)
+    assert len(server._pending[number]) <= controllers.TRIES
     assert len(server._nonces) <= controllers.NONCES
     server.tidy(1e6)
     assert not server._pending
