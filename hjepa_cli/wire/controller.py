@@ -33,7 +33,7 @@ LEAD_STEPS = 12  # that forces are computed ahead of the device, at least
 CLOCK_INTERVALS = 3  # all of which a device must be slow in to be taken for slow
 FADED_STEPS = 512  # since its newest embedding: then a device is served after all others
 CLOCK_DATAGRAMS = 16  # of whose arrivals the earliest tells how late the others are
-GREETING = (200.0, 400.0)  # hellos a second of all strangers, and at once
+GREETING = (200.0, 400.0)  # hellos a second of all devices, and at once; as many of other versions
 ALLOWANCE = (1.5, 32.0)  # datagrams per control step of a device, and at once
 PENDING = 1024  # devices with sessions that have not been proved yet
 TRIES = 4  # such sessions of one device: the newest ones, of which one that proves itself stays
@@ -225,7 +225,7 @@ class Controller:
         self._most, self._timeout_s, self._random = most_devices, timeout_s, random
         self.sessions: dict[int, Session] = {}
         self._pending: collections.OrderedDict[int, deque[Session]] = collections.OrderedDict()
-        self._greeting = Bucket(*GREETING)
+        self._greeting, self._greeting_others = Bucket(*GREETING), Bucket(*GREETING)
         self._nonces: collections.OrderedDict[bytes, None] = collections.OrderedDict()
         self._fresh: dict[int, Session] = {}
         self._due: list[tuple[float, int, Session]] = []  # heaps by when, and what is stale
@@ -255,11 +255,11 @@ class Controller:
     def _refuse_version(
         self, data: bytes, version: int, address: Address, now_s: float
     ) -> Outgoing:
-        """Answer a hello of another version, whose nonce lies where ours does, in our own."""
+        """Answer a hello of another version, whose nonce and tag lie where ours do, in our own."""
         self.counts["other_version"] += 1
         if data[3] != protocol.HELLO or len(data) < 76 + protocol.TAG_BYTES:
             return []
-        if not self._greeting.take(now_s):
+        if not self._admit(data, self._greeting_others, now_s):
             return []
         self.say(f"a device speaks version {version} of the protocol; this is {protocol.VERSION}")
         device = int.from_bytes(data[4:8], "little")
@@ -269,22 +269,32 @@ class Controller:
         answer = Answer(device, nonce, server_nonce, reason, self.bundle.digest, self.bundle.plant)
         return auth.tagged(self._key, protocol.pack_answer(answer))
 
-    def _greet(self, data: bytes, address: Address, now_s: float) -> Outgoing:
-        """Answer a hello; the session counts once a datagram proves that the device has its key."""
+    def _admit(self, data: bytes, allowance: Bucket, now_s: float) -> bool:
+        """Say whether a hello is of somebody with the key, is no recording, and is within bounds.
+
+        What has no tag of ours spends nothing: or strangers could keep devices out.
+        """
         if not auth.is_tagged(self._key, data):
             self.counts["forged"] += 1
+            return False
+        nonce = data[8:16]
+        if nonce in self._nonces:
+            self.counts["doubled"] += 1
+            return False
+        if not allowance.take(now_s):
+            self.counts["limited"] += 1
+            return False
+        self._nonces[nonce] = None
+        while len(self._nonces) > NONCES:
+            self._nonces.popitem(last=False)
+        return True
+
+    def _greet(self, data: bytes, address: Address, now_s: float) -> Outgoing:
+        """Answer a hello; the session counts once a datagram proves that the device has its key."""
+        if not self._admit(data, self._greeting, now_s):
             return []
         hello = protocol.parse(data)
         assert isinstance(hello, Hello)
-        if hello.nonce in self._nonces:
-            self.counts["doubled"] += 1
-            return []
-        if not self._greeting.take(now_s):
-            self.counts["limited"] += 1
-            return []
-        self._nonces[hello.nonce] = None
-        while len(self._nonces) > NONCES:
-            self._nonces.popitem(last=False)
         self.counts["hellos"] += 1
         known = hello.device in self.sessions
         reason = protocol.WELCOME

@@ -164,7 +164,8 @@ class Device:
                     self._session = None
                     return True
         except protocol.OtherVersion as error:
-            if data[3] == protocol.ANSWER and data[8:16] == self._nonce:
+            ours = data[3] == protocol.ANSWER and data[8:16] == self._nonce
+            if ours and auth.is_tagged(self._key, data):
                 self.refused, self.server_version = protocol.OTHER_VERSION, error.args[0]
         except protocol.Malformed:
             pass

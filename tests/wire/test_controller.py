@@ -149,6 +149,12 @@ def ready():
     return server, one, sent, answers
 
 
+def of_version(version, data):
+    """Return what a side of another version sends, whose head and tag lie where ours do."""
+    body = data[:2] + bytes([version]) + data[3 : -protocol.TAG_BYTES]
+    return auth.tagged(linear.KEY, body)
+
+
 def test_old_doubled_and_foreign_datagrams_change_nothing():
     server, one, sent, answers = ready()
     overtaken = one.embed(3, np.ones(linear.SIZE, np.float32))
@@ -213,9 +219,7 @@ def test_another_key_another_model_another_version_and_no_place():
         other.receive(data, 0, 0.0)
     assert (other.refused, other.plant) == (protocol.OTHER_MODEL, "linear")
     newer = linear.device(3)
-    hello = bytearray(newer.upkeep(0.0))
-    hello[2] = 7
-    ((answer, _),) = server.receive(bytes(hello), 3, 0.0)
+    ((answer, _),) = server.receive(of_version(7, newer.upkeep(0.0)), 3, 0.0)
     newer.receive(answer, 0, 0.0)
     assert newer.refused == protocol.OTHER_VERSION
     first, second = linear.device(4), linear.device(5)
@@ -229,10 +233,24 @@ def test_another_key_another_model_another_version_and_no_place():
 def test_an_older_server_is_told_from_a_newer_one():
     one = linear.device()
     one.upkeep(0.0)
-    answer = bytearray(linear.controller()._answer(1, one._nonce, bytes(8), 0))
-    answer[2] = 3
-    one.receive(bytes(answer), 0, 0.0)
+    answer = of_version(3, linear.controller()._answer(1, one._nonce, bytes(8), 0))
+    one.receive(answer[: -protocol.TAG_BYTES] + bytes(protocol.TAG_BYTES), 0, 0.0)
+    assert not one.refused  # anybody could have said that
+    one.receive(answer, 0, 0.0)
     assert (one.refused, one.server_version) == (protocol.OTHER_VERSION, 3)
+
+
+def test_who_has_no_key_is_of_no_version():
+    """A flood of hellos of other versions is not answered, and keeps nobody else out."""
+    server, one = linear.controller(), linear.device()
+    untagged = b"HJ\x07\x01" + bytes(72 + protocol.TAG_BYTES)
+    for _ in range(2 * int(controllers.GREETING[1])):
+        assert server.receive(untagged, "stranger", 0.0) == []
+    linear.connect(server, one)
+    for number in range(2 * int(controllers.GREETING[1])):  # one with the key keeps out its like
+        server.receive(of_version(7, linear.device(number).upkeep(0.0)), number, 0.0)
+    assert server.counts["limited"] == controllers.GREETING[1]
+    linear.connect(server, linear.device(2))
 
 
 def test_a_hundred_thousand_bad_datagrams_change_nothing():
