@@ -514,6 +514,9 @@ class Controller:
 
     def _plan(self, sessions: list[Session]) -> Outgoing:
         """Plan the next stride of each, and return the datagrams that tell them."""
+        sessions = [session for session in sessions if not self._is_used_up(session)]
+        if not sessions:
+            return []
         z = np.stack([session.z for session in sessions])  # type: ignore[misc]
         forces_n, z_next = self._runtime.plan(z)
         outgoing = []
@@ -526,6 +529,14 @@ class Controller:
         self.counts["strides"] += len(sessions)
         self.counts["sent"] += len(sessions)
         return outgoing
+
+    def _is_used_up(self, session: Session) -> bool:
+        """Forget a session whose numbers end; say so. Its device begins another one at step 0."""
+        if max(session.planned, session.counter) < protocol.MOST_STEPS:
+            return False
+        self.counts["used_up"] += 1
+        self._forget(session.hello.device)
+        return True
 
     def farewell(self) -> Outgoing:
         """Return what tells all devices that the controller ends."""

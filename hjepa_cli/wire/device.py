@@ -144,10 +144,11 @@ class Device:
         return auth.tagged(self._session, protocol.pack_embedding(packet))
 
     def bye(self) -> bytes | None:
-        """Return what ends the session."""
-        if self._session is None:
+        """End the session; return what tells the controller."""
+        session, self._session = self._session, None
+        if session is None:
             return None
-        return auth.tagged(self._session, protocol.pack_bye(protocol.Bye(self.number)))
+        return auth.tagged(session, protocol.pack_bye(protocol.Bye(self.number)))
 
     def receive(self, data: bytes, step: int, now_s: float) -> bool:
         """Take a datagram that comes in a step; say whether it changed anything."""
@@ -275,4 +276,5 @@ class OnInnovation:
         return due
 
     def _overdue(self, step: int) -> bool:
-        return self._sent is not None and step - self._sent >= self._longest
+        """Say whether nothing was sent for long, or steps have begun anew since."""
+        return self._sent is not None and not 0 <= step - self._sent < self._longest

@@ -90,8 +90,11 @@ class Drive:
                 on the device, or it has driven for ``stop_after_s``.
         """
         device, period_s = self._device, self._device.period_s
-        start_s, k = time.monotonic(), 0
-        while steps is None or k < min(steps, protocol.NO_STEP - 1):
+        start_s, k, done = time.monotonic(), 0, 0
+        while steps is None or done < steps:
+            if k == protocol.MOST_STEPS:  # another session, whose steps begin anew
+                self.leave()
+                start_s, k = start_s + k * period_s, 0
             begins_s = start_s + k * period_s
             if (late_s := time.monotonic() - begins_s) > LATE_STEPS * period_s:
                 start_s += late_s
@@ -108,7 +111,7 @@ class Drive:
             self._actuator.play(played.forces_n)
             self._judge(played.source, stop_after_s)
             self._receive(k, begins_s + period_s, wait=True)
-            k += 1
+            k, done = k + 1, done + 1
 
     def leave(self) -> None:
         """Tell the controller that this device ends."""

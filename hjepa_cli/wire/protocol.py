@@ -18,6 +18,7 @@ HELLO, ANSWER, EMBEDDING, FORCES, BYE = 1, 2, 3, 4, 5
 TAG_BYTES = 16
 LARGEST_BYTES = 1200  # fits any link's packet, IPv6 tunnels included
 NO_STEP = 2**32 - 1
+MOST_STEPS = 2**31  # of a session; no number of it reaches 32 bits until it ends
 MOST_FORCES = 64  # of all steps and axes of a datagram
 
 WELCOME, OTHER_MODEL, OTHER_VERSION, FULL, UNSUITED = 0, 1, 2, 3, 4
@@ -82,7 +83,7 @@ class Embedding(NamedTuple):
 
     Attributes:
         device: its number.
-        step: the control step it is in.
+        step: the control step it is in, below :data:`MOST_STEPS`.
         capture_age: steps since the embedding was captured.
         forces_n: the last force that it applied [m].
         force_age: steps since the step that force was for.
@@ -263,6 +264,8 @@ def _embedding(data: bytes) -> Embedding:
     _, _, _, device, step, capture_age, force_age, source, *rest = found
     number, answered, lag_steps, scale, _, _, reserved = rest
     _zero(reserved)
+    if step >= MOST_STEPS:
+        raise Malformed("a step that no session has")
     if capture_age > step or source >= len(SOURCES) or not (np.isfinite(scale) and scale >= 0):
         raise Malformed("an embedding's numbers")
     forces_n = _floats(data, axes, _EMBEDDING.size)

@@ -350,6 +350,39 @@ def test_who_has_no_key_spends_no_device_s_allowance():
     assert server.sessions[one.number].address == "new"
 
 
+def at_the_last_step(server, one):
+    server.receive(one.embed(protocol.MOST_STEPS - 1, np.ones(linear.SIZE, np.float32)), 1, 0.0)
+
+
+def with_all_counters(server, one):
+    server.sessions[one.number].counter = 2**32 - 2
+
+
+def after_an_hour_of_silence_at_a_microsecond_a_step(server, one):
+    quick = Device(linear.bundle(), one.number, linear.KEY, 1e-6)
+    linear.connect(server, quick)
+    server.receive(quick.embed(0, np.ones(linear.SIZE, np.float32)), 1, 0.0)
+    server.work(0.0)
+
+
+@pytest.mark.parametrize(
+    "end",
+    [at_the_last_step, with_all_counters, after_an_hour_of_silence_at_a_microsecond_a_step],
+)
+def test_a_session_whose_numbers_end_ends_alone(end):
+    """None of them has more than 32 bits; the server goes on with all other devices."""
+    server, one, *_ = ready()
+    end(server, one)
+    for now_s in (0.0, 0.1, 5_000.0):
+        for data, _ in linear.settle(server, now_s):
+            protocol.parse(data)
+    assert not server.sessions and server.counts["used_up"] == 1
+    other = linear.device(2)
+    linear.connect(server, other)
+    server.receive(other.embed(0, np.ones(linear.SIZE, np.float32)), 2, 0.0)
+    assert linear.settle(server, 0.0)
+
+
 def test_behind_schedule_it_skips_what_is_past():
     server, *_ = ready()
     planned, before = server.sessions[1].planned, server.counts["strides"]
@@ -499,3 +532,4 @@ def test_on_innovation_it_sends_first_when_wrong_and_when_long_silent():
     assert not rule.due(24, 0.01)
     assert rule.wants_look(116) and rule.due(116, None)
     assert not rule.wants_look(117)
+    assert rule.wants_look(1) and rule.due(1, None)  # in a session whose steps have begun anew

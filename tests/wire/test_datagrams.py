@@ -35,7 +35,7 @@ def test_hello_and_answer_come_back(device, period, nonce):
 
 
 @given(
-    step=st.integers(255, 2**32 - 2),
+    step=st.integers(255, 2**31 - 1),
     age=st.integers(0, 255),
     forces=st.lists(FLOAT, min_size=1, max_size=8),
     codes=st.binary(min_size=1, max_size=512),
@@ -110,6 +110,13 @@ def test_a_force_that_is_not_finite_is_refused(bad):
     packet = Forces(1, 2, 3, 4, np.full((4, 1), bad, np.float32))
     with pytest.raises(protocol.Malformed, match="finite"):
         protocol.parse(auth.tagged(KEY, protocol.pack_forces(packet)))
+
+
+@given(st.integers(2**31, 2**32 - 1))
+def test_a_step_that_no_session_has_is_refused(step):
+    packet = Embedding(*(7, step, 0, np.ones(1, np.float32)), *(0,) * 5, 4.0, np.ones(8, np.int8))
+    with pytest.raises(protocol.Malformed, match="step"):
+        protocol.parse(auth.tagged(KEY, protocol.pack_embedding(packet)))
 
 
 def test_another_version_is_told_apart():

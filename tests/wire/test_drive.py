@@ -1,0 +1,76 @@
+"""A device's loop against a controller in the same process, behind a socket that is none."""
+
+import socket
+from contextlib import closing
+
+import linear
+import numpy as np
+import pytest
+
+from hjepa_cli.wire import protocol
+from hjepa_cli.wire.device import EverySteps
+from hjepa_cli.wire.drive import Drive
+
+SERVER = ("127.0.0.1", 4747)
+PERIOD_S = 0.003
+
+
+class Line:
+    """A controller where a device's socket should be; what it says can be waited for as usual."""
+
+    def __init__(self, controller):
+        self.controller, self.now_s, self.steps = controller, 0.0, []
+        self._ours, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._ours.setblocking(False)
+        self.fileno, self.recvfrom = self._ours.fileno, self._ours.recvfrom
+
+    def sendto(self, data, address):
+        self.now_s += PERIOD_S
+        if protocol.peek(data)[0] == protocol.EMBEDDING:
+            self.steps.append(protocol.parse(data).step)
+        outgoing = self.controller.receive(data, "device", self.now_s)
+        for answer, _ in outgoing + linear.settle(self.controller, self.now_s):
+            self._theirs.send(answer)
+
+    def close(self):
+        self._ours.close()
+        self._theirs.close()
+
+
+class Plant:
+    """Its camera, its actuator and its encoder."""
+
+    frames = None
+
+    def read(self):
+        return True
+
+    def play(self, forces_n):
+        pass
+
+    def encode(self, frames):
+        return np.ones((1, linear.SIZE), np.float32)
+
+
+@pytest.fixture
+def line():
+    with closing(Line(linear.controller(most_devices=1))) as opened:
+        yield opened
+
+
+def drive_of(line, lines, **more):
+    device = linear.device(1, **more)
+    device.period_s = PERIOD_S
+    plant = Plant()
+    drive = Drive(device, plant, plant, plant, EverySteps(10), line, SERVER, lines.append)
+    return device, drive
+
+
+def test_steps_beyond_those_of_a_session_begin_another_one(line, monkeypatch):
+    """A device runs longer than 31 bits can count; who drives it changes for a moment at most."""
+    monkeypatch.setattr(protocol, "MOST_STEPS", 40)
+    device, drive = drive_of(line, [])
+    drive.connect()
+    drive.run(90, None)
+    assert line.steps == [0, 10, 20, 30] + [1, 10, 20, 30] + [1]
+    assert line.controller.counts["sessions"] == 3 and device.counts["planned"] > 80
