@@ -18,7 +18,7 @@ from hjepa_cli.wire.protocol import HELD, LOCAL, NO_STEP, PLANNED, ZERO, Embeddi
 from hjepa_cli.wire.runtime import Singles
 
 WATCHDOG_S = 0.08  # at most, in the plant's own time: poles that only hold a force fall soon after
-HELLO_S = 0.1  # between tries
+HELLO_S = (0.1, 0.8)  # between tries, at first and at most: an answer must come before the next one
 AGAIN_STEPS = 20  # between first embeddings of a session, until one is answered; after silence too
 QUIET_S = 0.5  # without a datagram the session is taken to be gone
 
@@ -69,7 +69,7 @@ class Device:
         )
         self.refused, self.plant, self.server_version = protocol.WELCOME, "", protocol.VERSION
         self._session: bytes | None = None
-        self._nonce, self._hello_s, self._tries = b"", -np.inf, 0
+        self._nonce, self._hello_s, self._wait_s = b"", -np.inf, 0.0
         self._heard_s, self._was_silent = -np.inf, False
         self._counter, self._sent, self._sent_step = 0, 0, -AGAIN_STEPS
         self._forces_n: dict[int, Singles] = {}
@@ -107,12 +107,13 @@ class Device:
 
     def upkeep(self, now_s: float) -> bytes | None:
         """Return a hello where one is due: without a session, or where it has become silent."""
-        if now_s - self._hello_s < HELLO_S:
+        if now_s - self._hello_s < self._wait_s:
             return None
         if self.connected and now_s - self._heard_s < QUIET_S:
             return None
         self._nonce, self._hello_s = self._random(), now_s
-        self._tries += 1
+        first_s, longest_s = HELLO_S
+        self._wait_s = min(max(2 * self._wait_s, first_s), longest_s)
         hello = Hello(
             *(self.number, self._nonce, round(self.period_s * 1e6), self.bundle.embedding),
             *(self.bundle.axes, protocol.INT8, self.bundle.digest, self.bundle.plant),
@@ -190,8 +191,7 @@ class Device:
             self._counter, self._answered = 0, NO_STEP
             self._sent, self._sent_step = 0, -AGAIN_STEPS
             self._lag = int((now_s - self._hello_s) / self.period_s + 1e-6)
-            self._heard_s = now_s
-            self._nonce = b""
+            self._hear(now_s)
         return True
 
     def _take_forces(self, message: protocol.Forces, step: int, now_s: float) -> bool:
@@ -203,10 +203,15 @@ class Device:
         fresh = enumerate(message.forces_n, message.first)
         self._forces_n = kept | {at: forces_n for at, forces_n in fresh if at >= step}
         self._was_silent |= now_s - self._heard_s >= QUIET_S
-        self._heard_s, self.silent = now_s, 0
+        self._hear(now_s)
+        self.silent = 0
         if message.base != self._answered:
             self._answered, self._lag = message.base, max(step - message.base, 0)
         return True
+
+    def _hear(self, now_s: float) -> None:
+        """Note that the session lives: an answer to a hello that is under way would end it."""
+        self._heard_s, self._nonce, self._wait_s = now_s, b"", 0.0
 
     # -- forces ---------------------------------------------------------------------------------
 

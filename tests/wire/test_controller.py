@@ -433,6 +433,25 @@ def test_a_restarted_server_takes_a_device_up_within_a_second():
             fresh.receive(killed.embed(step, np.ones(linear.SIZE, np.float32)), 1, now_s)
 
 
+@pytest.mark.parametrize("round_trip_steps", [5, 20, 70])
+def test_a_device_connects_over_a_long_round_trip(round_trip_steps):
+    """Each hello makes the answers to those before worthless: they come ever more rarely."""
+    server, one = linear.controller(), linear.device()
+    flying, z = {}, np.ones(linear.SIZE, np.float32)
+    for step in range(400):
+        now_s = step * linear.PERIOD_S
+        sent = [one.upkeep(now_s), one.embed(step, z) if one.is_new(step) else None]
+        answers = [answer for data in sent if data for answer in server.receive(data, 1, now_s)]
+        flying[step + round_trip_steps] = answers + linear.settle(server, now_s)
+        for data, _ in flying.pop(step, []):
+            one.receive(data, step, now_s)
+        one.play(step)
+    assert one.counts["planned"] > 50
+    assert server.counts["sessions"] == 1 and server.counts["hellos"] <= 6
+    tries = [k for k in range(400, 900) if one.upkeep(k * linear.PERIOD_S)]  # the server is gone
+    np.testing.assert_allclose(np.diff(tries)[:6], [10, 20, 40, 80, 80, 80], atol=1)
+
+
 def test_a_device_tells_a_server_that_comes_back_what_it_sees_now():
     """Both were stopped only; what the server knows is old, and the next embedding may be far."""
     server, one, *_ = ready()

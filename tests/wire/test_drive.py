@@ -12,7 +12,7 @@ from hjepa_cli.wire.device import EverySteps
 from hjepa_cli.wire.drive import Drive
 
 SERVER = ("127.0.0.1", 4747)
-PERIOD_S = 0.003
+PERIOD_S = 0.002
 
 
 class Line:
@@ -72,5 +72,5 @@ def test_steps_beyond_those_of_a_session_begin_another_one(line, monkeypatch):
     device, drive = drive_of(line, [])
     drive.connect()
     drive.run(90, None)
-    assert line.steps == [0, 10, 20, 30] + [1, 10, 20, 30] + [1]
+    assert line.steps == [0, 10, 20, 30, 1, 10, 20, 30, 1]
     assert line.controller.counts["sessions"] == 3 and device.counts["planned"] > 80
