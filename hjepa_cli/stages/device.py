@@ -109,7 +109,7 @@ def run(
         except Unavailable as error:
             if not local:
                 raise
-            screen.say(f"{error.message}: the actor on the device drives until it does")
+            screen.say(f"{error.message}: the actor on the device drives meanwhile")
         try:
             drive.run(steps, stop_after_s)
         finally:

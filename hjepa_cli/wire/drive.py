@@ -69,8 +69,8 @@ class Drive:
         while not self._device.connected:
             self._send(self._device.upkeep(time.monotonic()))
             self._receive(0, min(time.monotonic() + 0.02, until_s))
-            if self._device.refused:
-                raise refusal(self._device, self._server)
+            if error := self._refusal():
+                raise error
             if time.monotonic() >= until_s and not self._device.connected:
                 raise Unavailable(
                     f"no answer from {written(self._server)} within {CONNECT_S:g} s",
@@ -86,8 +86,9 @@ class Drive:
             stop_after_s: of silence, in wall time; ``None``: the actor goes on for ever.
 
         Raises:
-            Unavailable: no picture, no actuator; or the controller is silent and there is no actor
-                on the device, or it has driven for ``stop_after_s``.
+            Unavailable: no picture, no actuator; or the controller is silent or has no place, and
+                there is no actor on the device, or it has driven for ``stop_after_s``.
+            DataError: the controller runs another model by now, or another version.
         """
         device, period_s = self._device, self._device.period_s
         start_s, k, done = time.monotonic(), 0, 0
@@ -105,8 +106,7 @@ class Drive:
             self._send(device.upkeep(time.monotonic()))
             asked = self._look(k)
             self._receive(k, begins_s + DEADLINE * period_s, k if asked else None)
-            if device.refused:
-                raise refusal(device, self._server)
+            self._heed_refusal()
             played = device.play(k)
             self._actuator.play(played.forces_n)
             self._judge(played.source, stop_after_s)
@@ -143,6 +143,21 @@ class Drive:
             return None
         limit_n = self._device.bundle.force_limit_n
         return float(np.abs(self._runtime.act(z)[0] - planned_n).mean() / (2 * limit_n))
+
+    def _refusal(self) -> HjepaError | None:
+        """Return why the controller will not drive this device, once; it goes on asking."""
+        error = refusal(self._device, self._server) if self._device.refused else None
+        self._device.refused = protocol.WELCOME
+        return error
+
+    def _heed_refusal(self) -> None:
+        """End where a refusal cannot pass, or nobody drives until it does; else say it."""
+        if (error := self._refusal()) is None:
+            return
+        if not isinstance(error, Unavailable) or not self._device.has_actor:
+            raise error
+        if self._is_time("refusal"):
+            self._say(f"{error.message}: the actor on the device drives meanwhile")
 
     def _judge(self, source: int, stop_after_s: float | None) -> None:
         """Tell when who drives changes; stop where nobody does."""

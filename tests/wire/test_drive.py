@@ -1,14 +1,16 @@
 """A device's loop against a controller in the same process, behind a socket that is none."""
 
 import socket
+import time
 from contextlib import closing
 
 import linear
 import numpy as np
 import pytest
 
+from hjepa_cli.errors import DataError, Unavailable
 from hjepa_cli.wire import protocol
-from hjepa_cli.wire.device import EverySteps
+from hjepa_cli.wire.device import Device, EverySteps
 from hjepa_cli.wire.drive import Drive
 
 SERVER = ("127.0.0.1", 4747)
@@ -58,12 +60,54 @@ def line():
         yield opened
 
 
-def drive_of(line, lines, **more):
-    device = linear.device(1, **more)
-    device.period_s = PERIOD_S
+def drive_of(line, lines, bundle=None, **more):
+    device = Device(bundle or linear.bundle(), 1, linear.KEY, PERIOD_S, **more)
     plant = Plant()
     drive = Drive(device, plant, plant, plant, EverySteps(10), line, SERVER, lines.append)
     return device, drive
+
+
+def take_the_only_place(line):
+    other = linear.device(2)
+    linear.connect(line.controller, other)
+    line.controller.receive(other.embed(0, np.ones(linear.SIZE, np.float32)), "other", 0.0)
+    return other
+
+
+def local_n():
+    return np.zeros(1, np.float32)
+
+
+def test_a_device_that_has_no_place_drives_itself_and_goes_on_asking(line):
+    """As it comes, and after the server has started anew; until the other one leaves."""
+    lines, other, started_s = [], take_the_only_place(line), time.monotonic()
+
+    def told():
+        return len([text for text in lines if "as many devices as it may" in text])
+
+    device, drive = drive_of(line, lines, actor=local_n, watchdog_steps=1)
+    with pytest.raises(Unavailable, match="as many devices as it may"):
+        drive.connect()
+    drive.run(100, None)
+    assert device.counts["local"] == 100 and told()
+    line.controller.receive(other.bye(), "other", 0.0)
+    drive.run(500, None)
+    assert device.counts["planned"] > 10
+    line.controller = linear.controller(most_devices=1)
+    take_the_only_place(line)
+    drive.run(500, None)
+    assert 2 <= told() <= 1 + (time.monotonic() - started_s)  # a line a second
+
+
+def test_a_refusal_that_cannot_pass_or_leaves_nobody_to_drive_ends(line):
+    other = linear.bundle(digest=b"e" * 32)
+    _, drive = drive_of(line, [], bundle=other, actor=local_n)
+    with pytest.raises(DataError, match="another model"):
+        drive.run(100, None)
+    take_the_only_place(line)
+    _, drive = drive_of(line, [], watchdog_steps=1000)
+    with pytest.raises(Unavailable, match="as many devices as it may"):
+        drive.run(100, None)
 
 
 def test_steps_beyond_those_of_a_session_begin_another_one(line, monkeypatch):
