@@ -45,6 +45,9 @@ STREAMS, APP, CHECKS, SCREEN = (
     "output/screen.py",
 )
 CHANNEL, ARRAYS, MODEL = "core/radio/channel.py", "core/arrays.py", "core/networks/model.py"
+CONTROLLER, DEVICE, DRIVE, PROTOCOL = (
+    f"wire/{name}.py" for name in ("controller", "device", "drive", "protocol")
+)
 
 NOT_ATOMIC = (
     (FILES, 'with open(temporary, "wb") as file:', 'with open(path, "wb") as file:'),
@@ -548,6 +551,61 @@ GUARDS: dict[str, tuple[Change, ...]] = {
     ),
     "test_sensor.py::test_what_a_camera_cannot_have_is_refused": (
         ("core/plants/sensor.py", "    if exposure_ms > step_ms * (1 + 1e-9):", "    if False:"),
+    ),
+    # 50: the wire
+    "test_controller.py::test_another_key_another_model_another_version_and_no_place": (
+        (CONTROLLER, "if not auth.is_tagged(self._key, data):", "if False:"),
+    ),
+    "test_controller.py::test_a_hundred_thousand_bad_datagrams_change_nothing": (
+        (CONTROLLER, "if one is not None and auth.is_tagged(one.key, data):", "if one is not None:"),
+    ),
+    "test_controller.py::test_old_doubled_and_foreign_datagrams_change_nothing": (
+        (CONTROLLER, 'if verdict != "new" or message.capture <= session.newest:', "if False:"),
+    ),
+    "test_controller.py::test_a_recorded_session_proves_nothing_to_a_new_server": (
+        (CONTROLLER, "if nonce in self._nonces:", "if False:"),
+    ),
+    "test_controller.py::test_recorded_hellos_do_not_end_a_handshake_under_way": (
+        (CONTROLLER, "deque(maxlen=TRIES)", "deque(maxlen=1)"),
+    ),
+    "test_controller.py::test_silent_devices_are_forgotten_and_memory_is_bounded": (
+        (CONTROLLER, "while len(self._pending) > PENDING:", "while False:"),
+    ),
+    "test_controller.py::test_one_device_cannot_take_more_than_its_allowance": (
+        (CONTROLLER, "if not session.allowance.take(now_s):  # last", "if False:  # last"),
+    ),
+    "test_controller.py::test_who_has_no_key_spends_no_device_s_allowance": (
+        (CONTROLLER, "        session = self._session_of(device, data)\n", "        if device in self.sessions and not self.sessions[device].allowance.take(now_s):\n            return []\n        session = self._session_of(device, data)\n"),
+    ),
+    "test_controller.py::test_who_has_no_key_is_of_no_version": (
+        (CONTROLLER, "if not self._admit(data, self._greeting_others, now_s):", "if not self._greeting.take(now_s):"),
+    ),
+    "test_controller.py::test_an_older_server_is_told_from_a_newer_one": (
+        (DEVICE, "if ours and auth.is_tagged(self._key, data):", "if ours:"),
+    ),
+    "test_datagrams.py::test_a_step_that_no_session_has_is_refused": (
+        (PROTOCOL, "if step >= MOST_STEPS:", "if False:"),
+    ),
+    "test_controller.py::test_a_session_whose_numbers_end_ends_alone": (
+        (CONTROLLER, "if max(session.planned, session.counter) < protocol.MOST_STEPS:", "if True:"),
+    ),
+    "test_drive.py::test_steps_beyond_those_of_a_session_begin_another_one": (
+        (DRIVE, "if k == protocol.MOST_STEPS:", "if False:"),
+    ),
+    "test_controller.py::test_a_device_connects_over_a_long_round_trip": (
+        (DEVICE, "min(max(2 * self._wait_s, first_s), longest_s)", "first_s"),
+    ),
+    "test_drive.py::test_a_device_that_has_no_place_drives_itself_and_goes_on_asking": (
+        (DRIVE, "if not isinstance(error, Unavailable) or not self._device.has_actor:", "if True:"),
+    ),
+    "test_drive.py::test_a_refusal_that_cannot_pass_or_leaves_nobody_to_drive_ends": (
+        (DRIVE, "if not isinstance(error, Unavailable) or not self._device.has_actor:", "if False:"),
+    ),
+    "test_controller.py::test_silence_holds_then_the_actor_on_the_device_drives": (
+        (DEVICE, "elif self.silent < self.watchdog_steps:", "elif True:"),
+    ),
+    "test_controller.py::test_forces_are_clipped_to_the_limit": (
+        (DEVICE, "np.clip(planned, -limit_n, limit_n)", "planned"),
     ),
 }  # fmt: skip
 
