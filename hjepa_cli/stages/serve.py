@@ -54,12 +54,15 @@ def run(
     parsed = {flag: parse_address(text, flag) for flag, text in doors.items() if text}
     secret = key_for(address, "--bind", key, make=True)
     bundle = open_bundle(model)
-    runtime = Runtime(bundle, backend)
-    runtime.warm_up("planner", "coarse", "fine")
-    controller = Controller(bundle, runtime, secret, most_devices=max_devices, timeout_s=timeout_s)
-    latest: dict[str, Any] = snapshot(controller, {}, time.monotonic())
     with contextlib.ExitStack() as open_doors:
+        # Before the networks are loaded: hellos that come meanwhile wait there; new ones are rare.
         opened = open_doors.enter_context(contextlib.closing(open_socket(address)))
+        runtime = Runtime(bundle, backend)
+        runtime.warm_up("planner", "coarse", "fine")
+        controller = Controller(
+            bundle, runtime, secret, most_devices=max_devices, timeout_s=timeout_s
+        )
+        latest: dict[str, Any] = snapshot(controller, {}, time.monotonic())
         listening = {"serving": written(opened.getsockname())}
         if "--metrics" in parsed:
             at = prometheus.exposed(*parsed["--metrics"], lambda: latest)

@@ -109,6 +109,37 @@ def test_a_server_that_is_killed_and_started_again_takes_its_devices_up():
     assert protocol.SOURCES[one._last.source] == "planned"
 
 
+def test_hellos_that_come_while_the_networks_are_loaded_wait(monkeypatch):
+    opened = []
+
+    class Serving:
+        def __init__(self, controller, opened, report, say):
+            self._socket = opened
+
+        def run(self, until_s):
+            assert self._socket.recv(100) == b"hello"
+
+    def warm_up(*names):
+        with open_socket(("127.0.0.1", 0)) as device:
+            device.sendto(b"hello", opened[0].getsockname())
+
+    def opening(address):
+        opened.append(open_socket(address))
+        return opened[0]
+
+    fakes = {
+        "open_bundle": lambda path: SimpleNamespace(plant="desktop", digest=b""),
+        "Runtime": lambda *given: SimpleNamespace(warm_up=warm_up),
+        "Controller": lambda *given, **more: None,
+        "snapshot": lambda *given: {},
+        "Server": Serving,
+        "open_socket": opening,
+    }
+    for name, fake in fakes.items():
+        monkeypatch.setattr(serve, name, fake)
+    serve.run(Screen(quiet=True), model=None, bind="127.0.0.1:0")
+
+
 def test_a_scrape_sees_one_whole_snapshot(monkeypatch):
     """It runs in a thread of its own: what it was given must not change under it."""
     scrapes = []
