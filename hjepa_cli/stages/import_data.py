@@ -41,7 +41,6 @@ from hjepa_cli.storage.shards import LOG, ShardLog, check_room, read_task, remov
 
 TASK = "import"  # in the first line of the log of an unfinished import
 IMPORTED_FRAMES_PER_S = 3000.0
-LEAST_R2 = 0.05  # below, pictures do not show any action
 
 Result = dict[str, Any]
 
@@ -328,17 +327,22 @@ def tell_alignment(verdict: alignment.Verdict | None, offset: int, screen: Scree
         screen.say("too little to test by inverse dynamics which action leads from which picture")
         return
     stated, best = verdict.r2[0], verdict.r2[verdict.best]
-    if verdict.best and verdict.clear:
+    warn = verdict.best and verdict.clear
+    said = verdict.best if warn else 0
+    others = [f"{offset + n} (R² {verdict.r2[n]:.2f})" for n in verdict.alike if n != said]
+    also = f"; {', '.join(others)} about as well: this test cannot tell which" if others else ""
+    if warn:
         screen.say(
-            f"warning: pictures show the action of row j + {offset + verdict.best} between picture "
+            f"warning: pictures show the action of row j + {offset + said} between picture "
             f"j and j + 1 (R² {best:.2f}), not that of row j + {offset} (R² {stated:.2f}); "
-            f"--action-offset {offset + verdict.best} says so"
+            f"--action-offset {offset + said} says so{also}"
         )
-    elif best < LEAST_R2:
+    elif best < alignment.LEAST_R2:
         screen.say(f"pictures hardly show any action (R² {best:.2f}): alignment is untested")
     else:
         screen.say(
-            f"alignment: no offset fits the pictures clearly better than {offset} (R² {stated:.2f})"
+            f"alignment: no offset fits the pictures clearly better than {offset} "
+            f"(R² {stated:.2f}){also if said in verdict.alike else ''}"
         )
 
 

@@ -3,7 +3,10 @@
 A picture, the one before it and the two after it show how the motion changes between picture j and
 picture j + 1, so the action that did that is read off them best. Actions of other rows are read off
 the same pictures; the row that fits best is where the action belongs. A law that sees the pictures
-makes neighbouring actions look alike, so the test decides only where one fits clearly better.
+makes neighbouring actions look alike. So does a plant whose speed changes at once, or only after
+the step: four pictures show two of its actions whole. Three would not, and see too little where
+forces move things by hundredths of a pixel. So the test decides only where one row fits clearly
+better and the stated one does not fit about as well.
 """
 
 import dataclasses
@@ -19,6 +22,8 @@ DEGREE = 4  # of the moments of a picture, in all
 FEATURES = 128  # random ones
 FOLDS = 4
 CLEARLY = 0.85  # of the error that is left at the stated offset
+ALIKE = 0.75  # of the best R²: rows from there on fit about as well
+LEAST_R2 = 0.05  # below, pictures do not show any action
 KEY = 0xA116
 RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
 LEAST_ROWS = 200
@@ -38,6 +43,11 @@ class Verdict:
     r2: dict[int, float]
     best: int
     clear: bool
+
+    @property
+    def alike(self) -> list[int]:
+        """Return the offsets that fit about as well as the best one."""
+        return [offset for offset, r2 in self.r2.items() if r2 >= ALIKE * self.r2[self.best]]
 
 
 def judge(frames: Sequence[Pixels], actions: Sequence[Floats]) -> Verdict | None:
@@ -72,13 +82,18 @@ def judge(frames: Sequence[Pixels], actions: Sequence[Floats]) -> Verdict | None
         weights = _ridge(features[~test], flat[~test] - flat[~test].mean(axis=0))
         miss = flat[test] - flat[~test].mean(axis=0) - features[test] @ weights
         left += (miss**2).reshape(-1, *y.shape[1:]).sum(axis=0)
-    errors, plain = (left / spread).mean(axis=-1), left.sum(axis=-1)
+    return decided((left / spread).mean(axis=-1), left.sum(axis=-1))
+
+
+def decided(errors: Floats, plain: Floats) -> Verdict:
+    """Return the verdict on what is left at each offset, as a share of the spread and in all."""
     place = int(np.argmin(errors))
     # A peak, whether or not actions fade from the first rows of an episode to its last.
     peak = 0 < place < 2 * WIDEST and place == int(np.argmin(plain))
-    clear = peak and bool(errors[place] < CLEARLY * errors[WIDEST])
+    fits, stated = 1 - errors[place], 1 - errors[WIDEST]
+    apart = errors[place] < CLEARLY * errors[WIDEST] and stated < ALIKE * fits
     r2 = {offset - WIDEST: float(1 - error) for offset, error in enumerate(errors)}
-    return Verdict(r2, place - WIDEST, bool(clear))
+    return Verdict(r2, place - WIDEST, bool(peak and apart and fits >= LEAST_R2))
 
 
 def _moments(frames: Pixels) -> Floats:
