@@ -27,12 +27,13 @@ from hjepa_cli.core.datasets.dataset import (
     write_shards,
 )
 from hjepa_cli.core.datasets.importing import alignment
+from hjepa_cli.core.datasets.importing.aligned import TIMES
 from hjepa_cli.core.datasets.importing.columns import Chosen
 from hjepa_cli.core.datasets.importing.episode import Recording
 from hjepa_cli.core.datasets.importing.opening import open_recording
 from hjepa_cli.core.datasets.importing.prepared import Options, Prepared, prepare
 from hjepa_cli.core.plants.frames import frame_bits
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.collect import telling_how_to_go_on
 from hjepa_cli.stages.plan import Plan
@@ -40,6 +41,8 @@ from hjepa_cli.storage.runs import continue_command
 from hjepa_cli.storage.shards import LOG, ShardLog, check_room, read_task, remove_log
 
 TASK = "import"  # in the first line of the log of an unfinished import
+SMALL = 0.05  # of a limit
+SLOW_S = 1.0  # between pictures
 IMPORTED_FRAMES_PER_S = 3000.0
 
 Result = dict[str, Any]
@@ -361,7 +364,9 @@ def describe(
         "frames": frames,
         "frame_shape": list(made.frame_shape),
         "step_s": prepared.known.step_s,
+        "step_from": prepared.step_from,
         "limits": list(prepared.known.limits),
+        "largest": list(prepared.largest),
         "states": list(prepared.known.states),
         "converted": sorted(made.said),
         "left_out": list(made.bad),
@@ -377,9 +382,32 @@ def tell(result: Mapping[str, Any], screen: Screen) -> None:
         screen.say(f"converted: {text}")
     for text in result["left_out"]:
         screen.say(f"left out: {text}")
+    tell_units(result, screen)
     states = f"{len(result['states'])} states" if result["states"] else "no states"
     screen.say(
         f"{result['episodes']} episodes, {result['frames']} frames, {len(result['limits'])} "
-        f"actions, {states} in {result['seconds']:.1f} s: {result['dataset']}; next: hjepa data "
-        f"preview {result['dataset']}, hjepa train-encoder --dataset {result['dataset']}"
+        f"actions, {states} in {result['seconds']:.1f} s: {result['dataset']}; next: "
+        f"{shell(['hjepa', 'data', 'preview', result['dataset']])}, "
+        f"{shell(['hjepa', 'train-encoder', '--dataset', result['dataset']])}"
+    )
+
+
+def tell_units(result: Mapping[str, Any], screen: Screen) -> None:
+    """Say what times and actions were taken for, and warn where another unit is likely."""
+    step_s, limits, largest = (result[key] for key in ("step_s", "limits", "largest"))
+    if step_s > SLOW_S and result["step_from"] == TIMES:
+        screen.say(
+            f"warning: {step_s:g} s between pictures, from {TIMES}, which is in seconds: divide "
+            "it by 1000 if it holds milliseconds"
+        )
+    for number, (limit, most) in enumerate(zip(limits, largest, strict=True)):
+        if most < SMALL * limit:
+            screen.say(
+                f"warning: action {number} is never above {most:.3g}, {most / limit:.1%} of its "
+                f"limit {limit:g}: are they in the same unit?"
+            )
+    given, recorded = (", ".join(f"{one:.4g}" for one in values) for values in (limits, largest))
+    screen.say(
+        f"{1 / step_s:.4g} pictures/s (from {result['step_from']}), limits {given}; "
+        f"largest recorded {recorded}"
     )

@@ -307,6 +307,73 @@ def test_bad_folders_films_and_tables_are_refused_in_one_line(shell, tmp_path):
     (root / "run_1.mkv").write_bytes(data)
 
 
+def test_the_import_ends_with_its_units_and_warns_where_others_are_likely(shell, tmp_path):
+    pytest.importorskip("PIL")
+    frames, actions, _ = recordings.make(episodes=3, steps=8)
+    sizes = np.abs(actions).max(axis=(0, 1))
+    source = save(tmp_path / "r.npz", frames, actions)
+    outcome = shell("data", "import", source, *SAID, "--out", "in unit", "--json")
+    listed = ", ".join(f"{size:.4g}" for size in sizes)
+    words = f"20 pictures/s (from --fps), limits 1, 1; largest recorded {listed}"
+    said = outcome.err.splitlines()[-2:]
+    assert said[0] == words and "are they in the same unit" not in outcome.err
+    assert said[1].endswith("data preview 'in unit', hjepa train-encoder --dataset 'in unit'")
+    assert outcome.document["largest"] == pytest.approx(sizes)
+
+    more = ("--limit", "1,25", *SIZE, "--fps", 20)
+    outcome = shell("data", "import", source, *more, "--out", "large")
+    assert "action 0 is" not in outcome.err
+    assert f"action 1 is never above {sizes[1]:.3g}, {sizes[1] / 25:.1%} of" in outcome.err
+
+    root = recordings.folder(tmp_path / "r", frames, actions)
+    table = (root / "rows.csv").read_text().splitlines()
+    for unit, warned in ((20, True), (0.02, False)):
+        times = ["time", *(unit * (row % 8) for row in range(24))]
+        rows = [f"{row},{time}" for row, time in zip(table, times, strict=True)]
+        (root / "rows.csv").write_text("\n".join(rows))
+        outcome = shell("data", "import", root, "--limit", 1, *SIZE, "--out", f"u{unit}")
+        assert f"{1 / unit:g} pictures/s (from its column of times)" in outcome.err
+        assert ("divide it by 1000" in outcome.err) == warned
+
+
+def test_tables_of_other_programs_are_read_or_refused_by_what_is_in_them(shell, tmp_path):
+    pytest.importorskip("PIL")
+    frames, actions, _ = recordings.make(episodes=2, steps=8)
+    root = recordings.folder(tmp_path / "r", frames, actions)
+    table = (root / "rows.csv").read_text()
+
+    def refused(text, *words):
+        (root / "rows.csv").write_text(text)
+        with shell.untouched():
+            outcome = shell("data", "import", root, *SAID, "--out", "d")
+        assert_one_line_error(outcome, 65, *words)
+
+    for separator in ";\t":
+        words = ("rows.csv", f"separated by {separator!r}, expected ','")
+        refused(table.replace(",", separator), *words)
+    refused(table.replace("action_y", "action_x"), "rows.csv has 2 columns 'action_x'")
+    header, *rows = table.splitlines()
+    for names in (header, header.replace("episode", "run")):
+        refused(names, "rows.csv has a header and no rows")
+    broken = "\n".join([header, "", *rows]).replace("0_0000.png,", "0_0000.png,x")
+    refused(broken, "rows.csv, line 3: action_x = 'x")
+    (root / "rows.csv").write_text("\n".join(["", header, "", *rows, "", "  ", ""]))
+    outcome = shell("data", "import", root, *SAID, "--out", "d")
+    assert outcome.code == 0, outcome
+    assert np.array_equal(trajectories(tmp_path / "d").frames, frames[[0]])
+
+
+def test_the_limits_that_a_refusal_names_are_taken(shell, tmp_path):
+    frames, actions, _ = recordings.make(episodes=2, steps=8)
+    actions[..., 0], actions[0, 3, 1] = 0, 1.23444  # to four digits that is less
+    save(tmp_path / "r.npz", frames, actions)
+    unlimited = ("--fps", 20, *SIZE, "--out", "d")
+    outcome = shell("data", "import", "r.npz", *unlimited)
+    assert_one_line_error(outcome, 2, "are 0,1.234", "hint: --limit 1,1.235, or")
+    outcome = shell("data", "import", "r.npz", "--limit", "1,1.235", *unlimited)
+    assert outcome.code == 0 and "action 0 is never above 0, 0.0% of its limit 1" in outcome.err
+
+
 def test_npz_never_unpickles_and_says_what_is_missing(shell, tmp_path):
     frames, actions, _ = recordings.make(episodes=3, steps=8)
     ragged = np.empty(2, object)

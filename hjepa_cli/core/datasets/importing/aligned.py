@@ -1,6 +1,7 @@
 """An episode's actions are put beside the pictures that they lead from, scaled and checked."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from hjepa_cli.errors import DataError, UsageError
 ROUNDING = 1e-6  # of a limit
 UNEVEN = 0.1  # of the usual time between pictures
 LEAST_ROWS = 4  # for two steps, and the rows around them
+TIMES = "its column of times"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,10 +56,11 @@ def limits_of(recording: Recording, limits: Sequence[float] | None) -> tuple[flo
         if recording.limits is not None and len(recording.limits) == len(most):
             return recording.limits
         shown = ",".join(f"{value:.4g}" for value in most)
+        enough = ",".join(f"{_limit_above(value):.4g}" for value in most)
         raise UsageError(
             f"nobody says what limits the {len(most)} actions have; the largest recorded ones "
             f"are {shown}",
-            hint=f"--limit {shown}, or a limit above: actions are stored divided by it",
+            hint=f"--limit {enough}, or a limit above: actions are stored divided by it",
         )
     if len(limits) == 1:
         limits = [*limits] * len(most)
@@ -69,23 +72,23 @@ def limits_of(recording: Recording, limits: Sequence[float] | None) -> tuple[flo
     return tuple(limits)
 
 
-def step_of(recording: Recording, step_s: float | None) -> float:
-    """Return the time between pictures: the one given, or the source's, or that of its times.
+def step_of(recording: Recording, step_s: float | None) -> tuple[float, str]:
+    """Return the time between pictures, and who says so: ``--fps``, the source or its times.
 
     Raises:
         UsageError: nobody says.
     """
     if step_s is not None:
-        return step_s
+        return step_s, "--fps"
     if recording.step_s is not None:
-        return recording.step_s
+        return recording.step_s, "the recording"
     for _, read in recording.episodes:
         try:
             times_s = read().times_s
         except DataError:
             continue
         if times_s is not None and len(times_s) > 1:
-            return float(np.median(np.diff(times_s)))
+            return float(np.median(np.diff(times_s))), TIMES
         break
     raise UsageError(
         "nobody says how many pictures a second there are", hint="--fps RATE, as --fps 50"
@@ -170,6 +173,14 @@ def largest(recording: Recording) -> Floats:
             recording.episodes[0][1]()  # which says what is wrong with it
         raise DataError("no episode has any action")
     return found
+
+
+def _limit_above(value: float) -> float:
+    """Return a limit of four digits that holds a value; 1 where an action never moved."""
+    if not value:
+        return 1.0
+    digit = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.ceil(value / digit - ROUNDING) * digit
 
 
 def _check_finite(name: str, what: str, values: Floats) -> None:

@@ -13,6 +13,7 @@ from hjepa_cli.errors import DataError, MissingInputError, UsageError
 
 TIMES = ("time_s", "timestamp", "time")
 EPISODE, PICTURE = "episode", ("frame", "file", "image", "picture")
+SEPARATORS = ";\t|"  # of other dialects
 BEGINNINGS = {"actions": "action", "states": "state", "expert": "expert"}
 
 
@@ -27,11 +28,15 @@ class Chosen:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A CSV file as text, with the names of its columns by what they hold."""
+    """A CSV file as text, with the names of its columns by what they hold.
+
+    ``lines`` are the numbers of its rows in the file, where lines may be blank.
+    """
 
     path: Path
     header: list[str]
     rows: list[list[str]]
+    lines: list[int]
     groups: dict[str, list[str]]
 
     @property
@@ -46,7 +51,7 @@ class Table:
 
     def episodes(self) -> dict[str, list[int]]:
         """Return the rows of each episode by its name, in order; all of one without a column."""
-        if EPISODE not in self.header:
+        if EPISODE not in self.header or not self.rows:
             return {"": list(range(len(self.rows)))}
         place, found = self.header.index(EPISODE), dict[str, list[int]]()
         for number, row in enumerate(self.rows):
@@ -70,7 +75,7 @@ class Table:
                 try:
                     values[place, at] = float(text) if text.strip() else math.nan
                 except ValueError:
-                    line = rows[place] + 2
+                    line = self.lines[rows[place]]
                     raise DataError(
                         f"{self.path}, line {line}: {column} = {text!r} is no number"
                     ) from None
@@ -83,17 +88,28 @@ def read(path: Path, chosen: Chosen) -> Table:
     Raises:
         MissingInputError: there is none.
         UsageError: a column that was named is not in it.
-        DataError: it is none, a line has another number of columns, or no column is an action's.
+        DataError: it is none, or separated otherwise; a line has another number of columns, two
+            columns have one name, or none is an action's.
     """
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
-            header, *rows = csv.reader(file, strict=True)
+            reader = csv.reader(file, strict=True)
+            written = [(reader.line_num, row) for row in reader if not _blank(row)]
+        (_, header), *below = written
     except FileNotFoundError:
         raise MissingInputError(f"{path} does not exist") from None
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} is no CSV file with a header: {error}") from None
     header = [name.strip() for name in header]
-    for number, row in enumerate(rows, start=2):
+    for separator in SEPARATORS:
+        if len(header) == 1 and separator in header[0]:
+            raise DataError(f"{path}: columns are separated by {separator!r}, expected ','")
+    for name in header:
+        if name and header.count(name) > 1:
+            raise DataError(
+                f"{path} has {header.count(name)} columns '{name}'; expected different names"
+            )
+    for number, row in below:
         if len(row) != len(header):
             raise DataError(
                 f"{path}, line {number}: {len(row)} columns; the header has {len(header)}"
@@ -111,4 +127,8 @@ def read(path: Path, chosen: Chosen) -> Table:
             f"{path} has no column whose name begins with action; it has {', '.join(header)}",
             hint="--actions A,B names the columns of actions",
         )
-    return Table(path, header, rows, groups)
+    return Table(path, header, [row for _, row in below], [line for line, _ in below], groups)
+
+
+def _blank(row: list[str]) -> bool:
+    return len(row) < 2 and not "".join(row).strip()

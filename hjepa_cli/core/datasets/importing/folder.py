@@ -47,7 +47,9 @@ def csv_files(directory: Path) -> list[Path]:
 
 
 def of_table(table: Table, rows: Sequence[int]) -> dict[str, Any]:
-    """Return what the rows of a table say of an episode."""
+    """Return what the rows of a table say of an episode. Raises DataError where it has none."""
+    if not rows:
+        raise DataError(f"{table.path} has a header and no rows")
     said: dict[str, Any] = {
         key: table.numbers(names, rows) for key, names in table.groups.items() if names
     }

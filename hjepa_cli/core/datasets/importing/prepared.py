@@ -3,6 +3,8 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from hjepa_cli.config.schema import CameraSettings, RecordedSettings
 from hjepa_cli.core.datasets.importing import alignment, assembly
 from hjepa_cli.core.datasets.importing.aligned import Aligned, align, limits_of, step_of
@@ -42,10 +44,15 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """It is what a dataset will be: how it is made, what is known of its plant, its origin."""
+    """It is what a dataset will be: how it is made, what is known of its plant, its origin.
+
+    ``step_from`` says who states the time between pictures; ``largest`` are the actions recorded.
+    """
 
     assembly: Assembly
     known: RecordedSettings
+    step_from: str
+    largest: tuple[float, ...]
     episodes: int
     format: str
     lossy: bool
@@ -84,7 +91,7 @@ def prepare(recordings: Mapping[str, Recording], options: Options) -> Prepared:
         DataError: an episode is unsound and ``skip_bad`` is off, or none is left.
     """
     train = recordings["train"]
-    limits, step_s = limits_of(train, options.limits), step_of(train, options.step_s)
+    limits, (step_s, step_from) = limits_of(train, options.limits), step_of(train, options.step_s)
     names = train.state_names or _numbered(train)
     known = RecordedSettings(step_s, limits, names, options.mirror)
     kind = Recorded.of(known)
@@ -101,7 +108,8 @@ def prepare(recordings: Mapping[str, Recording], options: Options) -> Prepared:
         split: _sound(one, known, options.offset, bad, skip_bad=options.skip_bad)
         for split, one in recordings.items()
     }
-    episodes = sum(map(len, sound.values()))
+    every = [one for some in sound.values() for one in some]
+    scaled = np.max([np.abs(one.actions).max(axis=0) for one in every], axis=0)
     if "test" not in sound:
         train_on, test_on = assembly.held_out(sound["train"], options.held_out)
         sound = {"train": train_on, "test": test_on, **{k: sound[k] for k in sound if k != "train"}}
@@ -122,7 +130,8 @@ def prepare(recordings: Mapping[str, Recording], options: Options) -> Prepared:
     shapes = options.camera.frame_shape, kind.action_shape
     made = Assembly(splits, *shapes, options.skip_bad, bad=bad)
     lossy = any(one.lossy for one in recordings.values())
-    return Prepared(made, known, episodes, train.format, lossy)
+    largest = tuple((scaled * limits).tolist())
+    return Prepared(made, known, step_from, largest, len(every), train.format, lossy)
 
 
 def _sound(
