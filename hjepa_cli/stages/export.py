@@ -43,6 +43,7 @@ def run(
         bundle = open_bundle(check)
     else:
         assert to is not None
+        exports.exportable(path, to, method)  # refused before it is said to take its time
         screen.say(f"exporting {path}, which takes a minute or two")
         bundle = exports.export(path, to, method)
     measured = exports.check(bundle, path, backend)

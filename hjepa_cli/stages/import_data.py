@@ -333,7 +333,7 @@ def tell_alignment(verdict: alignment.Verdict | None, offset: int, screen: Scree
     warn = verdict.best and verdict.clear
     said = verdict.best if warn else 0
     others = [f"{offset + n} (R² {verdict.r2[n]:.2f})" for n in verdict.alike if n != said]
-    also = f"; {', '.join(others)} about as well: this test cannot tell which" if others else ""
+    also = f"; about as well fits {', '.join(others)}: this test cannot tell" if others else ""
     if warn:
         screen.say(
             f"warning: pictures show the action of row j + {offset + said} between picture "

@@ -50,7 +50,9 @@ def test_a_row_that_the_pictures_show_as_well_is_not_recommended(plant):
     place_by, other = PLANTS[plant]
     verdict = judged(place_by)
     assert {0, other} <= set(verdict.alike) and not verdict.clear, verdict
-    assert f"better than 0 (R² {verdict.r2[0]:.2f}); {other} (R²" in told(verdict)
+    assert f"better than 0 (R² {verdict.r2[0]:.2f}); about as well fits {other} (R²" in told(
+        verdict
+    )
 
 
 def test_actions_that_are_logged_late_are_found_where_force_is_held_over_a_step():

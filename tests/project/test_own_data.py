@@ -65,15 +65,36 @@ def test_the_page_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
     late = (*stressed, "--delay-steps", "10", "--dry-run")
     assert_one_line_error(shell(*late), 2, "--delay-steps is about closed loops")
 
-    refused = shell("export", "runs/robot", "--to", "bundle", "--quiet")
+    refused = shell("export", "runs/robot", "--to", "bundle")
     assert_one_line_error(refused, 2, "learned from recordings")
+    assert "exporting" not in refused.err
     assert not (tmp_path / "bundle").exists()
+
+    newest = tmp_path / "data" / "recorded-0001" / "dataset.json"  # the one from Python
+    (tmp_path / "data" / "recorded-0001").rename(newest.parent.with_name("another robot"))
+    outcome = shell(*stressed[:3], "--checkpoint", "runs/robot", "--dataset", "data/another robot")
+    words = ("than dataset data/another robot has", "--dataset 'data/another robot', or pass")
+    assert_one_line_error(outcome, 65, *words)
 
     path = tmp_path / "runs" / "eval" / "0001" / "result.json"
     result = json.loads(path.read_text())
     del result["methods"]["hold"]["steps_within"]
     path.write_text(json.dumps(seals.sealed(result)))
     assert_one_line_error(shell("report", "runs/eval/0001"), 65, "steps_within")
+
+
+def test_the_import_of_the_page_is_without_a_warning(tmp_path, monkeypatch, capsys):
+    """Its action k leads from picture k to k + 1: nothing says otherwise."""
+    shell = open_shell(tmp_path, monkeypatch, capsys)
+    exec(compile(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0], "own_data.md", "exec"), {})
+    (line,) = re.findall(r"^    hjepa (data import .+)$", PAGE, re.MULTILINE)
+    outcome = shell(*line.split())
+    assert outcome.code == 0 and "warning" not in outcome.err
+    assert "alignment: no offset fits the pictures clearly better than 0" in outcome.err
+    with np.load(tmp_path / "recording.npz") as recorded:
+        largest = ", ".join(f"{most:.4g}" for most in np.abs(recorded["actions"]).max(axis=(0, 1)))
+    words = f"50 pictures/s (from --fps), limits 2, 2; largest recorded {largest}\n"
+    assert words in outcome.err
 
 
 @pytest.mark.parametrize("dry", [[], ["--dry-run"]], ids=["run", "plan"])

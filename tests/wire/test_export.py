@@ -157,6 +157,15 @@ def test_models_that_plan_nothing_and_other_directories_are_refused(tmp_path):
         export(zoo.resolve_model("desktop-h4m2l1"), tmp_path, None)
 
 
+def test_a_refusal_does_not_begin_with_how_long_it_takes(tmp_path, monkeypatch, capsys):
+    from command_line import assert_one_line_error, open_shell
+
+    shell = open_shell(tmp_path, monkeypatch, capsys)
+    outcome = shell("export", "desktop-reflex", "--to", "new")
+    assert_one_line_error(outcome, 2, "plans no strides")
+    assert "exporting" not in outcome.err and not list(tmp_path.iterdir())
+
+
 def test_a_model_that_corrects_by_packets_is_exported_without_that():
     """A bundle has no posterior: as ``hjepa-fused`` it would drive as another method."""
     from hjepa_cli.core.control import drivers
