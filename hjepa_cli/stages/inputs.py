@@ -33,7 +33,7 @@ from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, plant_of
 from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.core.training.batches import shift_sideways
 from hjepa_cli.core.training.rendered import RenderedSplit
-from hjepa_cli.errors import DataError, MissingInputError, UsageError
+from hjepa_cli.errors import DataError, MissingInputError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 
 CHUNK = 20  # trajectories rendered or encoded at a time: progress shows, memory stays small
@@ -135,11 +135,16 @@ def refuse_recorded(settings: Settings, why: str) -> None:
         )
 
 
-def check_same_plant(metadata: Mapping[str, Any], settings: Settings, what: str) -> None:
+def check_same_plant(
+    metadata: Mapping[str, Any], settings: Settings, what: str, dataset: Path | None = None
+) -> None:
     """Raise DataError where a checkpoint is of another plant, or of other pictures, than settings.
 
-    ``what`` names the checkpoint.
+    ``what`` names the checkpoint; the settings are those that ``dataset``, where known, brings.
     """
+    where = f"dataset {dataset}" if dataset else "the dataset"
+    trained = ["hjepa", "train-encoder", "--dataset", dataset or "DIR"]
+    hint = f"{shell(trained)}, or pass another --dataset DIR"
     theirs = metadata["plant"]
     if theirs != settings.plant:
         raise DataError(
@@ -150,18 +155,18 @@ def check_same_plant(metadata: Mapping[str, Any], settings: Settings, what: str)
     if size != settings.camera:
         raise DataError(
             f"{what} was trained on pictures of {shown(size)}, "
-            f"the dataset has {shown(settings.camera)}",
-            hint="hjepa train-encoder, with this dataset",
+            f"{where} has {shown(settings.camera)}",
+            hint=hint,
         )
     if sensor_in(metadata["settings"]) != settings.sensor:
         raise DataError(
-            f"{what} was trained on pictures of another sensor than the dataset has",
-            hint="hjepa train-encoder, with this dataset",
+            f"{what} was trained on pictures of another sensor than {where} has",
+            hint=hint,
         )
     if theirs == RECORDED and plant_in(theirs, metadata["settings"]) != plant_of(settings):
         raise DataError(
-            f"{what} was trained on recordings of another plant than the dataset has",
-            hint="hjepa train-encoder, with this dataset",
+            f"{what} was trained on recordings of another plant than {where} has",
+            hint=hint,
         )
 
 

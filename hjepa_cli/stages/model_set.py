@@ -184,7 +184,7 @@ def open_model_set(
         )
     if model:
         if settings.plant == RECORDED and dataset:
-            check_same_plant(model.metadata, settings, f"model {path}")
+            check_same_plant(model.metadata, settings, f"model {path}", dataset)
         if (trained_by := model.metadata["settings"].get("preset")) != settings.preset:
             screen.say(
                 f"model {path} was trained by preset {trained_by}: its recipe and law count, not "

@@ -15,7 +15,7 @@ from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.plants.control_law import instability
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.core.training.law_search import GAPS, LawSearch
-from hjepa_cli.errors import NumericalError, UsageError
+from hjepa_cli.errors import NumericalError, UsageError, shell
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.inputs import refuse_recorded
 from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
@@ -70,7 +70,7 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     _show(result, screen)
     screen.say(
         f"law {result['law']} in {result['seconds']:.0f} s; "
-        f"next: hjepa collect --config {result['law']}"
+        f"next: {shell(['hjepa', 'collect', '--config', result['law']])}"
     )
     return result
 

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,6 +116,9 @@ def test_an_encoder_of_another_sensor_is_refused_for_a_dataset(model):
     check_same_plant(model.metadata, settings, "encoder")
     with pytest.raises(DataError, match="pictures of another sensor"):
         check_same_plant(model.metadata, load_settings(), "encoder")
+    with pytest.raises(DataError, match="sensor than dataset my data has") as caught:
+        check_same_plant(model.metadata, load_settings(), "encoder", Path("my data"))
+    assert caught.value.hint.startswith("hjepa train-encoder --dataset 'my data', or")
 
 
 def test_a_collection_cannot_be_of_a_sensor_that_is_told_off():

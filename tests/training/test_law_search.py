@@ -83,8 +83,9 @@ def test_the_command_writes_settings_for_the_next_one(hjepa: Shell) -> None:
     assert written["control"]["gains_n"] == np.ravel(result["gains_n"]).tolist()
     options = load_settings(config=result["law"])
     assert options.plant == "desktop" and len(options.control.ceiling_gains_n) == 4
-    again = hjepa("tune-law", "--config", "c.toml", "--json", "--out", "again").document
-    assert again["gains_n"] == result["gains_n"]
+    again = hjepa("tune-law", "--config", "c.toml", "--json", "--out", "once more")
+    assert again.document["gains_n"] == result["gains_n"]
+    assert "next: hjepa collect --config 'once more/law.toml'" in again.err
 
 
 @pytest.mark.parametrize("link", ["delay_steps = 15", "jitter_steps = 2", "downlink_loss = 0.1"])
