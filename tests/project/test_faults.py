@@ -170,6 +170,8 @@
 | 49 | conditions that there are not | test_stress.py::test_what_is_no_condition_is_refused |
 | 49 | frames that a device has forgotten | test_frames_apart.py::test_frames_that_a_device_has_forgotten_are_refused |
 | 49 | an exposure of more than a step | test_sensor.py::test_what_a_camera_cannot_have_is_refused |
+| 49 | rows of actions that fit alike | test_alignment.py::test_what_is_left_decides |
+| 49 | a column of a table taken twice | test_import.py::test_tables_of_other_programs_are_read_or_refused_by_what_is_in_them |
 | 50 | forged tag on a hello | test_controller.py::test_another_key_another_model_another_version_and_no_place |
 | 50 | forged tag in a session | test_controller.py::test_a_hundred_thousand_bad_datagrams_change_nothing |
 | 50 | datagram that is doubled, late or reflected | test_controller.py::test_old_doubled_and_foreign_datagrams_change_nothing |
