@@ -471,7 +471,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         (EXECUTORS, "                check_answer(target[\"address\"])", "                pass"),
     ),
     "test_strange_clusters.py::test_a_file_that_no_scheduler_wrote_is_refused": (
-        (EXECUTORS, "    if not Path(where).exists():\n        return where", "    return where"),
+        (EXECUTORS, "    if not Path(where).exists():\n        if", "    return where\n    if True:\n        if"),
     ),
     "test_small_things.py::test_a_dry_run_refuses_what_the_command_would": (
         ("stages/view.py", "    check(settings, screen, out=out, devices=devices, every=every, fps=fps, live=live)\n    models", "    models"),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.checks import changed, check_gaps, check_methods
-from hjepa_cli.config.schema import IDEAL_LINK, RECORDED, Settings
+from hjepa_cli.config.schema import IDEAL_LINK, RECORDED, Settings, declared, flag_of
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import MissingInputError, UsageError, require
@@ -128,13 +128,16 @@ def plan(
 
 def refuse_closed_loop(settings: Settings, **flags: bool) -> None:
     """Raise UsageError for what is about closed loops, where there are recordings alone."""
-    given = [f"--{name}" for name, value in flags.items() if value]
-    given += [key for key in changed(settings.protocol, "protocol") if key in OF_LOOPS]
+    given: dict[str, str | None] = {f"--{name}": None for name, value in flags.items() if value}
+    for key in changed(settings.protocol, "protocol"):
+        if key in OF_LOOPS and (flag := flag_of(declared()[key])):
+            given[flag.name] = key
     if given:
+        name, key = next(iter(given.items()))
         raise UsageError(
-            f"{given[0]} is about closed loops; a recorded plant has none",
+            f"{name} is about closed loops; a recorded plant has none",
             hint="hjepa eval --dataset DIR, without it",
-            key=given[0] if given[0] in OF_LOOPS else None,
+            key=key,
         )
 
 
