@@ -143,7 +143,8 @@ class OpenCv:
                 return None
             raise Unavailable(f"camera {self._source} gives no picture")
         self._some = True
-        return fitted(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), self._crop)
+        colours = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
+        return fitted(colours, self._crop)
 
     def close(self) -> None:
         """Give the camera back."""
