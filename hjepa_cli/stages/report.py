@@ -196,7 +196,8 @@ def read_film(path: Path) -> str:
     try:
         content = files.read_bytes(path, limit=FILM_LIMIT_BYTES)
     except MissingInputError as error:
-        raise MissingInputError(error.message, hint=f"hjepa view --out {path}") from None
+        hint = shell(["hjepa", "view", "--out", path])
+        raise MissingInputError(error.message, hint=hint) from None
     if not content.startswith((b"GIF87a", b"GIF89a")):
         raise UsageError(f"--film {path}: not a GIF", hint="hjepa view --out film.gif")
     return base64.b64encode(content).decode()
