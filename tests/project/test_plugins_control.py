@@ -17,7 +17,7 @@ from hjepa_cli import plugins
 from hjepa_cli.compute.executors import placed
 from hjepa_cli.config.checks import check_methods, check_payload
 from hjepa_cli.config.schema import Settings
-from hjepa_cli.core.control.drivers import methods_of, planner_of
+from hjepa_cli.core.control.drivers import build_driver, methods_of, planner_of
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.bench import Bench
 from hjepa_cli.core.evaluation.curves import Digest
@@ -156,6 +156,29 @@ def test_curves_expire_with_a_codec(tmp_path: Path) -> None:
     first = Digest.of("model", tiny(("hold",), payload="signs"))
     loaded(tmp_path, CODEC + "# changed\n")
     assert Digest.of("model", tiny(("hold",), payload="signs")).protocol != first.protocol
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return untrained(tmp_path_factory.mktemp("model") / "model.safetensors")
+
+
+@pytest.mark.parametrize("count", ["-7", "0", "2.5", "None", "float('nan')"])
+def test_a_codec_counts_whole_bits(tmp_path: Path, count: str) -> None:
+    loaded(tmp_path, CODEC.replace("embedding: embedding", f"embedding: {count}"))
+    says = r"mine.py: codec 'signs': bits\(256\) = .*; expected a whole number above 0"
+    with pytest.raises(UsageError, match=says):
+        plugins.CODECS["signs"].bits(256)
+
+
+def test_methods_with_and_without_embeddings_are_charged_the_same(
+    tmp_path: Path, checkpoint: Path
+) -> None:
+    """A coder that says something else of its bits is not asked."""
+    loaded(tmp_path, CODEC.replace("    def send", "    bits = 1024\n\n    def send"))
+    model, settings = Model.load(checkpoint, "cpu"), tiny(("hold", "oracle"), payload="signs")
+    bits = {build_driver(name, settings, model).bits_per_transmission for name in settings.methods}
+    assert bits == {model.architecture["embedding"]}
 
 
 FRAMES = """

@@ -133,7 +133,8 @@ def embedding_driver(
     sensor = embedding_sensor(model, coder.send, camera)
     drives = controller or hold
     reactive = hold if family == "embedding" else drives
-    return Driver(name, sensor, drives, reactive, coder.bits, family, two_levels=two_levels)
+    bits = CODECS[settings.protocol.payload].bits(model.architecture["embedding"])
+    return Driver(name, sensor, drives, reactive, bits, family, two_levels=two_levels)
 
 
 def last_force(

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from numbers import Integral
 from typing import TYPE_CHECKING, Protocol
 
-from hjepa_cli.plugins import check_members
+from hjepa_cli.plugins import CODECS, check_members
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,11 +22,6 @@ if TYPE_CHECKING:
 
 class Coder(Protocol):
     """Is both ends of a link: a codec made ready for the embeddings of one model."""
-
-    @property
-    def bits(self) -> int:
-        """Return the bits of one transmission."""
-        ...
 
     def send(self, z: Tensor) -> Tensor:
         """Send embeddings [n, D]; the controller receives [n, D], float32."""
@@ -38,7 +34,9 @@ class Codec:
 
     Attributes:
         name: as in ``--payload``.
-        bits: counts the bits of one transmission of an embedding with D values.
+        bits: counts the bits of one transmission of an embedding with D values. Methods that send
+            none are charged the same, so nothing else counts them; another answer than a whole
+            number above 0 raises UsageError.
         fit: makes it ready for a model; raises UsageError where the model's embeddings do not suit.
         fitted: it is fitted to trajectories drawn from the settings, so that curves measured
             through it depend on them.
@@ -53,6 +51,16 @@ class Codec:
         """Raise UsageError for members that are of another kind."""
         check_members(self, callable, "bits", "fit")
         check_members(self, bool, "fitted")
+        count = self.bits
+
+        def bits(embedding: int) -> int:
+            found = count(embedding)
+            if isinstance(found, Integral) and found > 0:
+                return int(found)
+            says = f"codec '{self.name}': bits({embedding}) = {found!r}"
+            raise CODECS.fault(self.name, f"{says}; expected a whole number above 0")
+
+        object.__setattr__(self, "bits", bits)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,9 +13,8 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Float:
-    """Sends every value as a floating-point number; ``bits`` are those of a transmission."""
+    """Sends every value as a floating-point number."""
 
-    bits: int
     half: bool
 
     def send(self, z: Tensor) -> Tensor:
@@ -26,9 +25,7 @@ def _codec(bits_per_value: int) -> Codec:
     return Codec(
         f"float{bits_per_value}",
         bits=lambda embedding: embedding * bits_per_value,
-        fit=lambda model, settings: Float(
-            model.architecture["embedding"] * bits_per_value, bits_per_value == 16
-        ),
+        fit=lambda model, settings: Float(half=bits_per_value == 16),
     )
 
 

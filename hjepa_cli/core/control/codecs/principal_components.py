@@ -39,10 +39,6 @@ class PrincipalComponents:
     reach: Tensor
     bits_per_value: int
 
-    @property
-    def bits(self) -> int:
-        return len(self.components) * self.bits_per_value
-
     def encode(self, z: Tensor) -> Tensor:
         """Encode embeddings [n, D] as codes [n, N], whole numbers in 0 … 2^B − 1."""
         levels = 2**self.bits_per_value
