@@ -181,7 +181,10 @@ class Registry:
     def fault(self, name: str, what: str) -> UsageError:
         """Return the error for what an extension returned and may not, with where it came from."""
         source = self._added[name][1] if name in self._added else self.source(name)
-        return UsageError(f"plugin {source.name}: {what}" if source else what)
+        if source is None:
+            return UsageError(what)
+        hint = f"correct {source.name}, or run it again with --debug to see the traceback"
+        return UsageError(f"plugin {source.name}: {what}", hint=None if source.installed else hint)
 
     def values(self) -> list[Any]:
         """Return the extensions themselves, each once; of a family the family."""

@@ -38,6 +38,20 @@ def described(values: Any) -> str:
     return f"{text} from {float(values.min()):.6g} to {float(values.max()):.6g}"
 
 
+def check_answer(values: Any, shape: tuple[int, ...], name: str, kind: type = np.ndarray) -> None:
+    """Raise ArrayError where what a function returned is no array, or tensor, of a shape.
+
+    NumPy and torch would stretch some that do not fit: one force for all devices in place of one
+    for each.
+    """
+    if not isinstance(values, kind):
+        raise ArrayError(f"{name} is a {type(values).__name__}; expected a {kind.__name__}")
+    found: Any = values
+    if found.shape != shape:
+        shown = f"{tuple(found.shape)} of {str(found.dtype).removeprefix('torch.')}"
+        raise ArrayError(f"{name} is {shown}; expected numbers of shape {tuple(shape)}")
+
+
 def array_from(values: ArrayLike, name: str) -> NDArray[Any]:
     """Return anything as an array; raise ArrayError for what is none, as lists of many lengths."""
     try:

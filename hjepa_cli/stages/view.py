@@ -17,7 +17,6 @@ from hjepa_cli.compute import memory
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Integers
-from hjepa_cli.core.control.controllers import StrideController
 from hjepa_cli.core.control.drivers import build_driver, methods_of
 from hjepa_cli.core.control.link import described
 from hjepa_cli.core.control.link import facts as link_facts
@@ -79,7 +78,7 @@ class Believer:
         self._heard |= packets is not None
         if not self._heard:  # the link is late: a device is believed to be at rest
             states = np.zeros((len(delivered), self._probe.shape[1]))
-        elif isinstance(self._controller, StrideController):
+        elif hasattr(self._controller, "belief"):
             start, end, share = self._controller.belief
             states = self._read(start)
             states += share[:, None] * (self._read(end) - states)

@@ -253,6 +253,14 @@ def test_a_scheduler_that_scores_wrong_is_named(shell, score, says):
     assert_one_line_error(outcome, 2, "error: plugin mine.py", says)
 
 
+def test_a_function_that_takes_something_else_is_named(shell):
+    """No line of the file is in the traceback of such a call."""
+    Path("mine.py").write_text(LAW.replace("gap_steps, need, link", "gap_steps"))
+    plugins.load_file(Path("mine.py"))
+    with pytest.raises(plugins.UsageError, match=r"mine.py: law 'half-duty': TypeError: devices\("):
+        plugins.LAWS["half-duty"].asked("devices", 1.0, None, None)
+
+
 def test_an_error_of_a_worker_is_traced_to_the_plugin(shell):
     """What comes back from another process has its traceback as text alone."""
     from concurrent.futures.process import _ExceptionWithTraceback

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from command_line import block
 from test_evaluate import Output, elsewhere, quick_encoder, small, untrained
 from test_model_set import of_method, saved
@@ -17,7 +18,7 @@ from hjepa_cli import plugins
 from hjepa_cli.compute.executors import placed
 from hjepa_cli.config.checks import check_methods, check_payload
 from hjepa_cli.config.schema import Settings
-from hjepa_cli.core.control.drivers import build_driver, methods_of, planner_of
+from hjepa_cli.core.control.drivers import build_driver, coder_of, methods_of, planner_of
 from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.bench import Bench
 from hjepa_cli.core.evaluation.curves import Digest
@@ -158,9 +159,106 @@ def test_curves_expire_with_a_codec(tmp_path: Path) -> None:
     assert Digest.of("model", tiny(("hold",), payload="signs")).protocol != first.protocol
 
 
+ANSWERS = """
+import dataclasses
+import functools
+from hjepa_cli import register
+from hjepa_cli.core.control.controllers import LastForce
+from hjepa_cli.core.control.drivers import embedding_driver
+from hjepa_cli.core.control.methods.method import Method
+from hjepa_cli.core.control.methods.predictors import predictor
+
+class Planner:
+    stride = 2
+    def __init__(self, model): pass
+    def plan(self, z): return PLAN
+    def follow(self, z, forces_n, ages): return z[:1]
+
+class Controller:
+    def __init__(self, devices): pass
+    def act(self, delivered, packets): return ACT
+    def planned_n(self): return self.nothing_like_it
+
+def build(settings, model):
+    made = {"last": functools.partial(LastForce, lambda z: ACT), "own": Controller}.get(KIND, id)
+    driver = embedding_driver("mine", settings, model, made, family="mine")
+    return {"bits": dataclasses.replace(driver, bits_per_transmission=-7), "": 7}.get(KIND, driver)
+
+def any(architecture, plant): return True
+
+register(predictor("mine", Planner, offered=any) if KIND == "planner"
+         else Method("mine", "embedding", build, offered=any))
+"""
+
+
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return untrained(tmp_path_factory.mktemp("model") / "model.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("kind", "answer", "says"),
+    [
+        ("last", "z[:, :1]", r"act\(…\) is \(4, 1\) of float32; expected numbers of shape \(4,\)$"),
+        ("last", "z[:, :3]", r"act\(…\) is \(4, 3\)"),
+        ("last", "z[:1, 0]", r"act\(…\) is \(1,\)"),
+        ("last", "None", r"act\(…\) is \(\) of object"),
+        ("last", "z[:, 0] + float('nan')", r"act\(…\)\[0\] is nan; expected finite numbers$"),
+        ("own", "packets[:, :1]", r"act\(…\) is \(4, 1\)"),
+        ("own", "packets[:1, 0]", r"act\(…\) is \(1,\)"),
+        ("own", "packets[:, 0] / 0", r"act\(…\)\[0\] is (nan|-?inf)"),
+        ("planner", "z[:, :1], z", r"plan\(…\) is \(4, 1\) of float32; .* shape \(4, 2\)$"),
+        ("planner", "z[:, :2], z[:1]", r"embeddings of plan\(…\) is \(1, \d+\) .* \(4, \d+\)$"),
+        ("planner", "z[:, :2].numpy(), z", r"plan\(…\) is a ndarray; expected a Tensor$"),
+        ("planner", "None", "TypeError: cannot unpack"),
+        ("number", "0", "'int' object has no attribute 'act'$"),
+        ("bits", "0", "bits_per_transmission = -7; expected a whole number of at least 0$"),
+        ("", "0", r"build\(…\) made 7; expected a Driver$"),
+    ],
+)
+def test_a_method_that_answers_wrong_is_named(
+    tmp_path: Path, checkpoint: Path, kind: str, answer: str, says: str
+) -> None:
+    text = ANSWERS.replace("KIND", repr(kind)).replace("PLAN", answer).replace("ACT", answer)
+    loaded(tmp_path, text)
+    model = Model.load(checkpoint, "cpu")
+    z = torch.ones(4, model.architecture["embedding"])
+    with pytest.raises(UsageError, match=rf"^plugin .*mine\.py: method 'mine': .*{says}") as caught:
+        build_driver("mine", tiny(("mine",)), model).controller(4).act(np.ones(4, bool), z)
+    assert caught.value.exit_code == 2
+
+
+def test_what_else_a_plugin_s_controller_tells_names_it_too(
+    tmp_path: Path, checkpoint: Path
+) -> None:
+    model = Model.load(checkpoint, "cpu")
+    z = torch.zeros(4, model.architecture["embedding"])
+    loaded(tmp_path, ANSWERS.replace("KIND", "'planner'").replace("PLAN", "z[:, :2], z"))
+    controller = build_driver("mine", tiny(("mine",)), model).controller(4)
+    assert controller.stride_steps == 2 and not controller.act(np.ones(4, bool), z).any()
+    with pytest.raises(UsageError, match=r"mine.py: method 'mine': follow\(…\) is \(1, \d+\)"):
+        controller.act(np.ones(4, bool), z, np.full(4, 2))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("z.sign().float()", "z[:, :3]", r"send\(…\) is \(4, 3\) of float32; .* shape \(4, \d+\)$"),
+        ("z.sign().float()", "z.numpy()", r"send\(…\) is a ndarray; expected a Tensor$"),
+        ("z.sign().float()", "z.double()", r"send\(…\) is torch.float64; expected torch.float32$"),
+        ("z.sign().float()", "z / 0", r"send\(…\)\[0, 0\] is nan; expected finite numbers$"),
+        ("return Signs()", "return None", "'NoneType' object has no attribute 'send'$"),
+        ("def fit(model, settings)", "def fit(model)", r"TypeError: fit\(\) takes 1"),
+    ],
+)
+def test_a_codec_that_sends_wrong_is_named(
+    tmp_path: Path, checkpoint: Path, old: str, new: str, says: str
+) -> None:
+    loaded(tmp_path, CODEC.replace(old, new))
+    model = Model.load(checkpoint, "cpu")
+    z = torch.zeros(4, model.architecture["embedding"])
+    with pytest.raises(UsageError, match=rf"^plugin .*mine\.py: codec 'signs': .*{says}"):
+        coder_of(tiny(("hold",), payload="signs"), model).send(z)
 
 
 @pytest.mark.parametrize("count", ["-7", "0", "2.5", "None", "float('nan')"])

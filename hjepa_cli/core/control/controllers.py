@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hjepa_cli.core.arrays import Bools, Floats, Integers
+from hjepa_cli.core.arrays import Bools, Floats, Integers, check_answer
 from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.familiarity import PacketCheck
 from hjepa_cli.core.control.link import (
@@ -77,7 +77,7 @@ class _Strides:
         for number in range(further):
             rows = np.flatnonzero(self._heard & (self._ready == number))
             if len(rows):
-                planned_n = self._plan_later(rows, number).float().cpu()
+                planned_n = self._fitting(self._plan_later(rows, number), len(rows))
                 self._later_n[torch.from_numpy(rows), number] = planned_n
                 self._ready[rows] += 1
         strides_n = torch.cat([self._forces_n[:, None], self._later_n], 1).flatten(1, 2).numpy()
@@ -107,6 +107,11 @@ class _Strides:
     def _go_on(self, rows: Tensor) -> None:
         """Let the stride that comes next, and was planned already, be the present one."""
 
+    def _fitting(self, planned_n: Tensor, devices: int) -> Tensor:
+        """Return planned forces as they are kept; raise ArrayError for another shape."""
+        check_answer(planned_n, (devices, *self._forces_n.shape[1:]), "plan(…)", Tensor)
+        return planned_n.float().cpu()
+
     @property
     def _over(self) -> Bools:
         return np.asarray(self._heard & (self._phase == self._stride))
@@ -122,7 +127,8 @@ class _Strides:
                 self._ready[planned] -= 1
                 self._go_on(rows)
             if (new := due & ~planned).any():
-                self._forces_n[torch.from_numpy(new)] = self._plan(new).float().cpu()
+                planned_n = self._fitting(self._plan(new), int(new.sum()))
+                self._forces_n[torch.from_numpy(new)] = planned_n
             self._phase[due] = 0
         at = np.minimum(self._phase, self._stride - 1)  # 0 N of those not heard yet
         return np.asarray(self._forces_n.numpy()[np.arange(len(due)), at], dtype=np.float64)
@@ -174,14 +180,14 @@ class StrideController(_Strides):
                 "or leave out --delay-steps and --jitter-steps",
             )
         forces_n = self._sent.since(np.flatnonzero(delivered), ages)
-        return self._planner.follow(packets, torch.from_numpy(forces_n).float(), ages)
+        return self._follow(packets, torch.from_numpy(forces_n).float(), ages)
 
     def _plan(self, due: Bools) -> Tensor:
         if not self._starts.shape[1]:
             self._starts = torch.zeros_like(self._z)
         rows = torch.from_numpy(np.flatnonzero(due))
         self._starts[rows] = self._z[rows]
-        forces_n, self._z[rows] = self._planner.plan(self._z[rows])
+        forces_n, self._z[rows] = self._ahead(self._z[rows])
         return forces_n
 
     def _plan_later(self, rows: Integers, number: int) -> Tensor:
@@ -191,8 +197,20 @@ class StrideController(_Strides):
             )
         at = torch.from_numpy(rows)
         before = self._later_z[at, number - 1] if number else self._z[at]
-        forces_n, self._later_z[at, number] = self._planner.plan(before)
+        forces_n, self._later_z[at, number] = self._ahead(before)
         return forces_n
+
+    def _ahead(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the forces_n of a stride and the embeddings after it; ArrayError for no such."""
+        forces_n, reached = self._planner.plan(z)
+        check_answer(reached, z.shape, "the embeddings of plan(…)", Tensor)
+        return forces_n, reached
+
+    def _follow(self, z: Tensor, forces_n: Tensor, ages: Integers) -> Tensor:
+        """Return embeddings moved on by the planner; raise ArrayError for another shape."""
+        moved = self._planner.follow(z, forces_n, ages)
+        check_answer(moved, z.shape, "follow(…)", Tensor)
+        return moved
 
     def _go_on(self, rows: Tensor) -> None:
         self._starts[rows], self._z[rows] = self._z[rows], self._later_z[rows, 0]
@@ -258,9 +276,9 @@ class FusingController(StrideController):
             if ages.any():
                 since = self._anchor_ages[old]
                 forces_n = torch.from_numpy(self._sent.since(old, since)).float()
-                moved = self._planner.follow(self._anchors[at], forces_n, since - ages[known])
+                moved = self._follow(self._anchors[at], forces_n, since - ages[known])
             else:  # the stride that is being played leads there
-                moved = self._planner.follow(self._starts[at], self._forces_n[at], self._phase[old])
+                moved = self._follow(self._starts[at], self._forces_n[at], self._phase[old])
             predicted[torch.from_numpy(known)] = moved
         corrected = self._correct(predicted, packets)
         self._anchors[torch.from_numpy(rows)], self._anchor_ages[rows] = corrected, ages
@@ -359,9 +377,11 @@ class LastForce:
     def act(self, delivered: Bools, packets: Any) -> Floats:
         """Return the forces of one step [n, *A]; 0 N before a device's first packet."""
         if packets is not None:
-            forces_n = self._actor(packets)
-            fresh_n = forces_n.float().cpu().numpy() if isinstance(forces_n, Tensor) else forces_n
-            self._forces_n[delivered] = fresh_n * self._gain[delivered]
+            forces_n, gain = self._actor(packets), self._gain[delivered]
+            torchs = isinstance(forces_n, Tensor)
+            fresh_n = forces_n.float().cpu().numpy() if torchs else np.asarray(forces_n)
+            check_answer(fresh_n, (len(gain), *self._forces_n.shape[1:]), "act(…)")
+            self._forces_n[delivered] = fresh_n * gain
         self._played_n = self._forces_n
         played = self.planned_n()
         self._forces_n = self._forces_n * self._kept + 0.0  # which makes 0 of −0

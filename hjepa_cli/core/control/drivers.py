@@ -9,17 +9,20 @@ quantised and dequantised.
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from hjepa_cli.config.checks import late, split_late
 from hjepa_cli.config.schema import Settings
+from hjepa_cli.core.control.answers import GuardedCoder, GuardedController
 from hjepa_cli.core.control.codecs.codec import Coder
 from hjepa_cli.core.control.controllers import LastForce
 from hjepa_cli.core.control.disagreement import TwoLevels
 from hjepa_cli.core.control.embedded_split import sampled_embeddings
 from hjepa_cli.core.control.familiarity import PacketCheck, fit_familiarity
+from hjepa_cli.core.control.guarded import guarded
 from hjepa_cli.core.control.link import confirmation_bits
 from hjepa_cli.core.control.loop import Controller, Draws, Sensor
 from hjepa_cli.core.control.sensors import embedding_sensor
@@ -69,7 +72,8 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
     """Build any method by its name, on time or :func:`~hjepa_cli.config.checks.late`.
 
     Raises:
-        UsageError: no such method, no model that holds it, or a lateness that is no number.
+        UsageError: no such method, no model that holds it, a lateness that is no number, or a
+            plugin's method that builds no driver.
         DataError: the model is of another plant.
     """
     name, steps = split_late(name)
@@ -82,10 +86,12 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
         raise UsageError(f"method '{name}' needs a model of it", hint="hjepa models list")
     if model:
         settings = as_trained(settings, model)
-    driver: Driver = METHODS[name].build(settings, model)
+    kind = model.plant if model else plant(settings.plant)
+    driver: Driver = guarded(METHODS, name, METHODS[name].build)(settings, model)
+    if METHODS.source(name):
+        driver = _of_plugin(name, driver, kind.action_shape)
     if not driver.uses_link:
         return dataclasses.replace(driver, name=late(name, steps))
-    kind = model.plant if model else plant(settings.plant)
     told = confirmation_bits(settings.protocol, len(kind.force_signs))
     bits = driver.bits_per_transmission + told
     driver = dataclasses.replace(
@@ -94,6 +100,31 @@ def build_driver(name: str, settings: Settings, model: Model | None) -> Driver:
     if steps or not settings.protocol.ideal_link:  # a packet at every step leaves much to predict
         driver = dataclasses.replace(driver, reactive=driver.controller, family=driver.name)
     return driver
+
+
+def _of_plugin(name: str, driver: Driver, action_shape: tuple[int, ...]) -> Driver:
+    """Return a driver that a plugin built, whose answers are looked at."""
+    if not isinstance(driver, Driver):
+        raise METHODS.fault(name, f"method '{name}': build(…) made {driver!r}; expected a Driver")
+    bits = driver.bits_per_transmission
+    if not (isinstance(bits, Integral) and bits >= 0):
+        says = f"bits_per_transmission = {bits!r}; expected a whole number of at least 0"
+        raise METHODS.fault(name, f"method '{name}': {says}")
+
+    def watched(build: Callable[[int], Any] | None) -> Any:
+        def made(devices: int) -> GuardedController:
+            assert build is not None
+            return GuardedController(name, build(devices), (devices, *action_shape))
+
+        return build and guarded(METHODS, name, made)
+
+    return dataclasses.replace(
+        driver,
+        sensor=guarded(METHODS, name, driver.sensor),
+        controller=watched(driver.controller),
+        reactive=watched(driver.reactive),
+        two_levels=watched(driver.two_levels),
+    )
 
 
 def as_trained(settings: Settings, model: Model) -> Settings:
@@ -150,8 +181,9 @@ def coder_of(settings: Settings, model: Model) -> Coder:
 
     Raises UsageError for no such payload, or one that the model's embeddings do not suit.
     """
-    coder: Coder = CODECS[settings.protocol.payload].fit(model, settings)
-    return coder
+    name = settings.protocol.payload
+    coder: Coder = guarded(CODECS, name, CODECS[name].fit)(model, settings)
+    return GuardedCoder(name, coder) if CODECS.source(name) else coder
 
 
 @functools.lru_cache(maxsize=2)  # methods of one run share it

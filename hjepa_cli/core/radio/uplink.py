@@ -14,6 +14,7 @@ from hjepa_cli.compute.seeding import generator
 from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.core.control.disagreement import LevelDisagreement
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable
+from hjepa_cli.core.control.guarded import guarded
 from hjepa_cli.core.radio.doppler import Motion, moving_fading
 from hjepa_cli.core.radio.fading import block_fading
 from hjepa_cli.core.radio.phy.phy import Reports
@@ -79,7 +80,8 @@ class Uplink:
                 f"{access.blocks} resource blocks for {devices} devices; use 1 to {devices}"
             )
         self._access = access
-        self._score, self.listens = scheduler.score, scheduler.wants_reports
+        self._score = guarded(SCHEDULERS, access.scheduler, scheduler.score)
+        self.listens = scheduler.wants_reports
         k_factor_db = access.k_factor_db
         self._fading = (
             moving_fading(access.seed, devices, access.motion, k_factor_db=k_factor_db)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any
 
+from hjepa_cli.core.control.guarded import guarded
 from hjepa_cli.core.radio.cell import Cell, Link
 from hjepa_cli.core.radio.laws.law import Row, SharingLaw
 from hjepa_cli.core.radio.laws.requirement import Axis, LinkRequirement
@@ -47,7 +48,7 @@ class ClosedFormLaw(SharingLaw):
 
     def asked(self, member: str, *at: Any) -> Any:
         """Return what a function of the law says; raise UsageError where it may not say that."""
-        value = getattr(self, member)(*at)
+        value = guarded(LAWS, self.name, getattr(self, member))(*at)
         if member == "why_nobody":
             fits, wanted = isinstance(value, str), "text"
         else:

@@ -1,0 +1,66 @@
+"""Controllers and coders of plugins are looked at when they answer.
+
+Later nobody could say any more whose a force is that is NaN, or that is one for all devices. The
+package's own are used as they are: tests know them, and a loop asks at every step.
+"""
+
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hjepa_cli.core.arrays import Bools, Floats, check_answer, finite
+from hjepa_cli.core.control.codecs.codec import Coder
+from hjepa_cli.core.control.guarded import guarded
+from hjepa_cli.core.control.loop import Controller
+from hjepa_cli.errors import ArrayError
+from hjepa_cli.plugins import CODECS, METHODS
+
+
+class GuardedController:
+    """A plugin's controller, whose forces are one of each device and axis, and finite.
+
+    Args:
+        method: of the plugin.
+        controller: that it built.
+        shape: of the forces of one step, [n, *A].
+    """
+
+    def __init__(self, method: str, controller: Controller, shape: tuple[int, ...]) -> None:
+        self._controller, self._shape = controller, shape
+        self._guard = functools.partial(guarded, METHODS, method)
+        self.act = functools.wraps(controller.act)(self._guard(self._act))
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what else the controller tells, as the forces that it has planned."""
+        found = getattr(self._controller, name)
+        return self._guard(found) if name in ("planned_n", "ahead_n") else found
+
+    def _act(self, delivered: Bools, packets: Any, *ages: Any) -> Floats:
+        act: Any = self._controller.act
+        forces_n = np.asarray(act(delivered, packets, *ages))
+        check_answer(forces_n, self._shape, "act(…)")
+        finite(forces_n, "act(…)")
+        return forces_n
+
+
+class GuardedCoder:
+    """A plugin's coder, whose embeddings arrive as they were sent: of one shape, and finite."""
+
+    def __init__(self, codec: str, coder: Coder) -> None:
+        self._coder, self._guarded = coder, guarded(CODECS, codec, self._send)
+
+    def send(self, z: Tensor) -> Tensor:
+        """Send embeddings [n, D]; the controller receives [n, D], float32."""
+        return self._guarded(z)
+
+    def _send(self, z: Tensor) -> Tensor:
+        received: Tensor = self._coder.send(z)
+        check_answer(received, z.shape, "send(…)", Tensor)
+        if received.dtype != torch.float32:
+            raise ArrayError(f"send(…) is {received.dtype}; expected torch.float32")
+        if not torch.isfinite(received).all():
+            finite(received.cpu().numpy(), "send(…)")  # says which is not
+        return received
