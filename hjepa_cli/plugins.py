@@ -25,7 +25,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hjepa_cli.errors import MissingInputError, UsageError, choices
+from hjepa_cli.errors import MissingInputError, UsageError, choices, shell
 
 GROUP = "hjepa.plugins"
 LIMIT_BYTES = 2**20  # of a file that a person names and writes by hand
@@ -367,6 +367,12 @@ def _run(source: Source, text: str) -> None:
         sys.modules[name] = module  # dataclasses and pickle look there
         try:
             exec(compile(text, source.name, "exec"), module.__dict__)
+            added = [of for one in _REGISTRIES.values() for _, of in one._added.values()]
+            if source not in added:
+                raise UsageError(
+                    "it registers nothing",
+                    hint=f"hand what {source.name} makes to hjepa_cli.register(…)",
+                )
         except BaseException:
             del sys.modules[name]
             raise
@@ -393,11 +399,19 @@ def _transaction(source: Source, file: str, hint: str) -> Iterator[None]:
         reason = f"{name}: {lines[0]}" if lines and lines[0] else name
         if isinstance(error, UsageError):
             reason, hint = error.message, error.hint or hint
+        elif isinstance(error, ModuleNotFoundError) and (folder := _beside(file, error.name)):
+            hint = f"set PYTHONPATH={shell([folder])}, or install it: its folder is not searched"
         raise UsageError(f"plugin {_place(error, file)}: {reason}", hint=hint) from None
     else:
         _sources[:] = [one for one in _sources if one.name != source.name] + [source]
     finally:
         _loading.reset(token)
+
+
+def _beside(file: str, module: str | None) -> Path | None:
+    """Return the folder of a plugin's file where a module lies in it, too."""
+    folder, top = Path(file).resolve().parent, (module or "").partition(".")[0]
+    return folder if top and ((folder / f"{top}.py").is_file() or (folder / top).is_dir()) else None
 
 
 def _place(error: BaseException, file: str) -> str:

@@ -168,6 +168,30 @@ def test_a_family_that_makes_something_else_is_named(shell):
         plugins.CODECS["mine-8"]
 
 
+def test_a_file_that_registers_nothing_is_refused(shell):
+    """What it makes would be missed only later, as unknown."""
+    for text in ("", LAW.replace("register(", "id(")):
+        Path("bad.py").write_text(text)
+        outcome = shell("collect", "--plugin", "bad.py", "--dry-run")
+        assert_one_line_error(outcome, 2, "plugin bad.py: it registers nothing", "hint: hand what")
+        assert not plugins._sources
+
+
+def test_a_module_beside_a_plugin_is_found_on_the_path_alone(shell, monkeypatch):
+    """Workers run its text where its folder may not be, so that nobody searches there."""
+    Path("beside.py").write_text("name = 'patient'")
+    Path("mine.py").write_text("import beside\n" + SCHEDULER.replace('"patient"', "beside.name"))
+    plan = "scale", "--law", "scheduled", "--scheduler", "patient", "--dry-run"
+    outcome = shell(*plan, "--plugin", "mine.py")
+    assert_one_line_error(outcome, 2, "plugin mine.py:1: ModuleNotFoundError: No module named 'be")
+    assert outcome.err.endswith(
+        f"hint: set PYTHONPATH={Path.cwd()}, or install it: its folder is not searched\n"
+    )
+    monkeypatch.syspath_prepend(Path.cwd())
+    assert shell(*plan, "--plugin", "mine.py").code == 0
+    sys.modules.pop("beside")
+
+
 # Going wrong
 
 
@@ -265,7 +289,7 @@ def test_an_error_of_a_worker_is_traced_to_the_plugin(shell):
     """What comes back from another process has its traceback as text alone."""
     from concurrent.futures.process import _ExceptionWithTraceback
 
-    Path("mine.py").write_text("def fail():\n    return 1 / 0\n")
+    Path("mine.py").write_text("def fail():\n    return 1 / 0\n" + LAW)
     plugins.load_file(Path("mine.py"))
     [module] = [one for name, one in sys.modules.items() if name.startswith("hjepa_plugin_mine")]
     try:
