@@ -19,6 +19,7 @@ from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import STAGES
 from hjepa_cli.stages import bench_link
 from hjepa_cli.stages.resume import given_to
+from hjepa_cli.storage.checkpoints import load_checkpoint
 from hjepa_cli.storage.files import jsonable
 from hjepa_cli.storage.runs import Run
 from hjepa_cli.storage.zoo import resolve_model
@@ -127,7 +128,8 @@ def test_what_a_stage_was_given_is_what_resume_gives_it(name, given, shell, monk
     def create(stage, out, settings, inputs):
         raise Recorded(jsonable(inputs))
 
-    bundle = SimpleNamespace(digest=b"", frames=4, manifest={}, plant="desktop")
+    made_of = {"checkpoint": {"sha256": load_checkpoint(resolve_model(MODEL)).digest}}
+    bundle = SimpleNamespace(digest=b"", frames=4, manifest=made_of, plant="desktop")
     monkeypatch.setattr(bench_link, "open_bundle", lambda path: bundle)
     monkeypatch.setattr(bench_link, "check_plant", lambda bundle, settings: None)
     Path("trace").write_text("0\nlost\n")

@@ -41,7 +41,7 @@ def test_the_books_are_right(round_errors, monkeypatch):
     random, views, slots = np.random.default_rng(0), [], 800
     wishes = random.random((slots, DEVICES))
     spy = Scheduler("spy", lambda view: (views.append(view), wishes[len(views) - 1])[1])
-    monkeypatch.setattr(module, "SCHEDULERS", {"spy": spy})
+    monkeypatch.setitem(plugins.SCHEDULERS._added, "spy", (spy, None))
     growth = ErrorGrowthTable(np.ones(1))
     access = Access("spy", BLOCKS, MARGIN_DB, -math.inf, 1.0, round_errors, growth, SEED)
     uplink, books, outbox = Uplink(access, DEVICES), Books(len(round_errors)), Outbox()
