@@ -572,7 +572,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         (CONTROLLER, "if nonce in self._nonces:", "if False:"),
     ),
     "test_controller.py::test_recorded_hellos_do_not_end_a_handshake_under_way": (
-        (CONTROLLER, "deque(maxlen=TRIES)", "deque(maxlen=1)"),
+        (CONTROLLER, "deque(maxlen=protocol.TRIES)", "deque(maxlen=1)"),
     ),
     "test_controller.py::test_silent_devices_are_forgotten_and_memory_is_bounded": (
         (CONTROLLER, "while len(self._pending) > PENDING:", "while False:"),

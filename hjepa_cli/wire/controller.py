@@ -36,7 +36,6 @@ CLOCK_DATAGRAMS = 16  # of whose arrivals the earliest tells how late the others
 GREETING = (200.0, 400.0)  # hellos a second of all devices, and at once; as many of other versions
 ALLOWANCE = (1.5, 32.0)  # datagrams per control step of a device, and at once
 PENDING = 1024  # devices with sessions that have not been proved yet
-TRIES = 4  # such sessions of one device: the newest ones, of which one that proves itself stays
 NONCES = 8192  # of the newest hellos: one that comes again is a recording
 
 Address = Any
@@ -312,7 +311,7 @@ class Controller:
         server_nonce = self._random()
         if reason == protocol.WELCOME:
             key = auth.session_key(self._key, hello.device, hello.nonce, server_nonce)
-            tries = self._pending.setdefault(hello.device, deque(maxlen=TRIES))
+            tries = self._pending.setdefault(hello.device, deque(maxlen=protocol.TRIES))
             tries.appendleft(Session(hello, key, address, now_s, self.bundle.stride))
             self._pending.move_to_end(hello.device)
             while len(self._pending) > PENDING:

@@ -18,7 +18,7 @@ from hjepa_cli.wire.protocol import HELD, LOCAL, NO_STEP, PLANNED, ZERO, Embeddi
 from hjepa_cli.wire.runtime import Singles
 
 WATCHDOG_S = 0.08  # at most, in the plant's own time: poles that only hold a force fall soon after
-HELLO_S = (0.1, 0.8)  # between tries, at first and at most: an answer must come before the next one
+HELLO_S = (0.1, 0.4)  # between tries, at first and at most
 AGAIN_STEPS = 20  # between first embeddings of a session, until one is answered; after silence too
 QUIET_S = 0.5  # without a datagram the session is taken to be gone
 
@@ -69,7 +69,8 @@ class Device:
         )
         self.refused, self.plant, self.server_version = protocol.WELCOME, "", protocol.VERSION
         self._session: bytes | None = None
-        self._nonce, self._hello_s, self._wait_s = b"", -np.inf, 0.0
+        self._hello_s, self._wait_s = -np.inf, 0.0
+        self._asked_s: dict[bytes, float] = {}  # by nonce, of the newest hellos without an answer
         self._heard_s, self._was_silent = -np.inf, False
         self._counter, self._sent, self._sent_step = 0, 0, -AGAIN_STEPS
         self._forces_n: dict[int, Singles] = {}
@@ -111,11 +112,14 @@ class Device:
             return None
         if self.connected and now_s - self._heard_s < QUIET_S:
             return None
-        self._nonce, self._hello_s = self._random(), now_s
+        nonce, self._hello_s = self._random(), now_s
+        self._asked_s[nonce] = now_s
+        if len(self._asked_s) > protocol.TRIES:
+            del self._asked_s[next(iter(self._asked_s))]
         first_s, longest_s = HELLO_S
         self._wait_s = min(max(2 * self._wait_s, first_s), longest_s)
         hello = Hello(
-            *(self.number, self._nonce, round(self.period_s * 1e6), self.bundle.embedding),
+            *(self.number, nonce, round(self.period_s * 1e6), self.bundle.embedding),
             *(self.bundle.axes, protocol.INT8, self.bundle.digest, self.bundle.plant),
         )
         return auth.tagged(self._key, protocol.pack_hello(hello))
@@ -166,7 +170,7 @@ class Device:
                     self._session = None
                     return True
         except protocol.OtherVersion as error:
-            ours = data[3] == protocol.ANSWER and data[8:16] == self._nonce
+            ours = data[3] == protocol.ANSWER and data[8:16] in self._asked_s
             if ours and auth.is_tagged(self._key, data):
                 self.refused, self.server_version = protocol.OTHER_VERSION, error.args[0]
         except protocol.Malformed:
@@ -175,12 +179,13 @@ class Device:
         return False
 
     def _take_answer(self, data: bytes, now_s: float) -> bool:
-        if not self._nonce or not auth.is_tagged(self._key, data):
+        if not self._asked_s or not auth.is_tagged(self._key, data):
             self.ignored += 1
             return False
         answer = protocol.parse(data)
         assert isinstance(answer, protocol.Answer)
-        if answer.nonce != self._nonce:
+        asked_s = self._asked_s.get(answer.nonce)
+        if asked_s is None:
             self.ignored += 1
             return False
         self.refused, self.plant = answer.reason, answer.plant
@@ -190,7 +195,7 @@ class Device:
             )
             self._counter, self._answered = 0, NO_STEP
             self._sent, self._sent_step = 0, -AGAIN_STEPS
-            self._lag = int((now_s - self._hello_s) / self.period_s + 1e-6)
+            self._lag = int((now_s - asked_s) / self.period_s + 1e-6)
             self._hear(now_s)
         return True
 
@@ -211,7 +216,8 @@ class Device:
 
     def _hear(self, now_s: float) -> None:
         """Note that the session lives: an answer to a hello that is under way would end it."""
-        self._heard_s, self._nonce, self._wait_s = now_s, b"", 0.0
+        self._heard_s, self._wait_s = now_s, 0.0
+        self._asked_s.clear()
 
     # -- forces ---------------------------------------------------------------------------------
 

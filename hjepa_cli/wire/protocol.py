@@ -19,6 +19,7 @@ TAG_BYTES = 16
 LARGEST_BYTES = 1200  # fits any link's packet, IPv6 tunnels included
 NO_STEP = 2**32 - 1
 MOST_STEPS = 2**31  # of a session; no number of it reaches 32 bits until it ends
+TRIES = 4  # newest hellos of a device that may lead to a session: the first proved one stays
 MOST_FORCES = 64  # of all steps and axes of a datagram
 
 WELCOME, OTHER_MODEL, OTHER_VERSION, FULL, UNSUITED = 0, 1, 2, 3, 4
