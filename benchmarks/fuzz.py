@@ -373,7 +373,7 @@ class Shown(Target):
             curves.write(directory / "curves.json", DIGEST, methods)
             run.finish(
                 {
-                    "plant": "desktop", "seed": seed, "checkpoint": "m", "loop_version": 5,
+                    "plant": "desktop", "seed": seed, "checkpoint": "m", "loop_version": 6,
                     "acceptable_score": 0.62, "acceptable_lq_ratio": 0.5, "methods": methods,
                     "horizon": list(range(len(methods["hjepa"]["nmae"]))),
                     "training_seeds": dict.fromkeys(methods, seed), "source": "curves",

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hjepa_cli.config.checks import check_count, check_schedulable, check_uplink, resolve
 from hjepa_cli.config.schema import RECORDED, Settings
-from hjepa_cli.core.arrays import Floats
+from hjepa_cli.core.arrays import Floats, check_answer
 from hjepa_cli.core.control.drivers import build_driver, planner_of
 from hjepa_cli.core.control.loop import Draws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.datasets import dataset as datasets
@@ -79,8 +79,11 @@ def predict(model: Model, z: Tensor, steps: int, *, method: str = "hjepa") -> tu
     z = embeddings_from(z, model.architecture["embedding"]).to(model.device)
     forces_n = []
     for _ in range(-(-steps // planner.stride)):
-        played, z = planner.plan(z)
+        played, reached = planner.plan(z)
+        check_answer(played, (len(z), planner.stride, *model.action_shape), "plan(…)", Tensor)
+        check_answer(reached, z.shape, "the embeddings of plan(…)", Tensor)
         forces_n.append(played.float())
+        z = reached
     return torch.cat(forces_n, dim=1)[:, :steps].cpu(), z.float().cpu()
 
 

@@ -132,6 +132,8 @@ def _add_sources(settings: Settings, given: Given) -> None:
 def _one_rule(settings: Settings, given: Given) -> None:
     if given["innovation"] is not None and given["gap_steps"] != INPUTS["gap_steps:wire"].default:
         raise UsageError("--gap-steps and --innovation are two rules to send by; give one of them")
+    if given["innovation"] is None and given["longest_steps"] != INPUTS["longest_steps"].default:
+        raise UsageError("--longest counts only with --innovation; without it, give --gap-steps")
 
 
 def _one_schedule(settings: Settings, given: Given) -> None:

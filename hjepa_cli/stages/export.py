@@ -44,7 +44,7 @@ def run(
     else:
         assert to is not None
         exports.exportable(path, to, method)  # refused before it is said to take its time
-        screen.say(f"exporting {path}, which takes a minute or two")
+        screen.say(f"exporting {path}, which takes up to a minute")
         bundle = exports.export(path, to, method)
     measured = exports.check(bundle, path, backend)
     screen.table(

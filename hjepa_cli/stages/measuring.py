@@ -215,13 +215,13 @@ _Job = tuple[str, _Share]
 def _work(name: str) -> int:
     """Return the place of a method among those to measure: the longest first, or all wait for it.
 
-    What predicts nothing needs the most packets, and each takes as long as many steps without one;
-    true states take next to no time.
+    What predicts nothing needs the most packets, and each takes as long as many steps without one.
+    True states take next to no time; at the end they would keep one worker busy and the rest idle.
     """
     if not needs_model(name):
-        return 2
+        return 0
     method = METHODS[split_late(name)[0]]
-    return 1 if method.planner or method.reflex or method.fitted else 0
+    return 2 if method.planner or method.reflex or method.fitted else 1
 
 
 def _measure(

@@ -13,7 +13,7 @@ import math
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from hjepa_cli.core.control.planners import Hierarchy, OnePredictor
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import hold, plan_stride
-from hjepa_cli.core.networks.model import Model, load_modules
+from hjepa_cli.core.networks.model import KINDS, Model, load_modules
 from hjepa_cli.core.plants.control_law import control_of
 from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of, frames_seen
 from hjepa_cli.core.plants.named import camera_in
@@ -148,17 +148,24 @@ def exported_method(model: Model, method: str | None) -> str:
     able = [
         name
         for name in methods_of(model)
-        if getattr(METHODS[name], "planner", None) and name not in NOT_EXPORTED
+        if name not in NOT_EXPORTED and _in_bundles(getattr(METHODS[name], "planner", None), model)
     ]
     if not able:
         raise UsageError(
-            f"this model ({model.architecture['kind']}) plans no strides, which a controller on "
-            "the wire does",
+            f"this model ({model.architecture['kind']}) plans no strides that a bundle can hold: "
+            "those of hjepa or of one predictor",
             hint="hjepa models list; a hierarchy or a predictor of train-hierarchy can be exported",
         )
     if method is not None and method not in able:
         raise UsageError(f"this model cannot be exported as '{method}'; {choices(method, able)}")
     return method or able[0]
+
+
+def _in_bundles(planner: Callable[[Model], Any] | None, model: Model) -> bool:
+    """Say whether a method plans with the networks of a bundle; a plugin's may have others."""
+    if planner is None or model.architecture["kind"] not in KINDS:
+        return False
+    return isinstance(planner(model), Hierarchy | OnePredictor)
 
 
 def networks_of(model: Model, method: str) -> dict[str, tuple[nn.Module, Inputs, tuple[str, ...]]]:

@@ -80,6 +80,29 @@ def test_a_stride_controller_leaves_packets_as_they_are() -> None:
     assert packets.tolist() == [[3.0, 0.0], [4.0, 0.0]]
 
 
+def test_nothing_is_planned_for_devices_that_are_given_up() -> None:
+    planned = []
+
+    class Watched(Counting):
+        def plan(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            planned.append(z[:, 0].tolist())
+            return super().plan(z)
+
+    controller = StrideController(Watched(2), 3)
+    everybody, nobody = np.ones(3, dtype=bool), np.zeros(3, dtype=bool)
+    controller.act(everybody, torch.tensor([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
+    controller.give_up(np.array([False, True, False]))
+    forces = [controller.act(nobody, None) for _ in range(4)]
+    assert [force[[0, 2]].tolist() for force in forces] == [
+        [1000 + k, 3000 + k] for k in (1, 2, 3, 4)
+    ]
+    # A packet that was on its way is too late to help.
+    controller.act(everybody, torch.tensor([[4.0, 0.0], [5.0, 0.0], [6.0, 0.0]]))
+    controller.act(nobody, None)
+    controller.act(nobody, None)
+    assert planned == [[1, 2, 3], [1, 3], [1, 3], [4, 5, 6], [4, 6]]
+
+
 def test_planners_of_any_stride_agree_where_forces_are_held_alike() -> None:
     packets = torch.randn(3, 4, generator=torch.Generator().manual_seed(0))
     arrives = np.ones(3, dtype=bool)

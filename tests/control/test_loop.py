@@ -24,8 +24,11 @@ from hjepa_cli.core.control.loop import (
     packets_per_step,
     simulate,
 )
+from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
+from hjepa_cli.core.plants.cost import COST_CAP
 from hjepa_cli.core.plants.named import plant, teacher
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import NumericalError, UsageError
 
 DESKTOP = plant("desktop")
@@ -117,13 +120,53 @@ def test_steady_state_stays_when_the_scored_time_is_doubled_and_the_start_flatte
 
 
 def test_loops_that_fell_are_lost() -> None:
-    """Nobody drives: every pole falls past 1.58 rad, where its cost is capped."""
+    """Nobody drives: every pole falls."""
     draws = Draws.make(protocol(steps=600), 4, seed=0)
     drive = LastForce(lambda states: 0 * DESKTOP.teacher()(states), 4, keep=True)
     fallen = simulate(DESKTOP, draws, every_step(600, 4)[None], drive, true_state)
     held = LastForce(DESKTOP.teacher(), 4, keep=True)
     upright = simulate(DESKTOP, draws, every_step(600, 4)[None], held, true_state)
     assert fallen.lost.mean() > 0.5 and not upright.lost.any()
+
+
+def test_a_fallen_device_is_over() -> None:
+    """It sends nothing more, gets no force, is out of band and costs as much as a step can."""
+    heard, told, states, forces_n = [], [], [], []
+
+    class Pushes:
+        """It drives all but device 0, which it pushes over."""
+
+        def act(self, delivered: np.ndarray, packets: Any) -> np.ndarray:
+            heard.append(delivered.copy())
+            forces_n = np.zeros(3)
+            if packets is not None:
+                forces_n[delivered] = DESKTOP.teacher()(packets)
+            forces_n[0] = 20.0
+            return forces_n
+
+        def give_up(self, devices: np.ndarray) -> None:
+            told.append((len(heard), devices.copy()))
+
+    def watch(k: int, now: np.ndarray, played_n: np.ndarray) -> None:
+        states.append(now.copy())
+        forces_n.append(played_n.copy())
+
+    draws = Draws.make(protocol(steps=500), 3, seed=0)
+    outcome = simulate(DESKTOP, draws, every_step(500, 3)[None], Pushes(), true_state, watch=watch)
+    [(fell_at, devices)] = told
+    assert devices.tolist() == [True, False, False]
+    theta = np.array(states)[:, 0, 2]
+    assert fell_at == np.flatnonzero(np.abs(theta) >= np.pi / 2)[0]
+    assert 50 < fell_at < 450
+    sent, played_n = np.array(heard), np.array(forces_n)
+    assert sent[:fell_at].all() and sent[:, 1:].all() and not sent[fell_at:, 0].any()
+    assert (played_n[:fell_at, 0] == 20).all() and (played_n[fell_at:, 0] == 0).all()
+    before = DESKTOP.cost(np.array(states)[:fell_at, 0], played_n[:fell_at, 0])
+    cost = (before.sum() + (500 - fell_at) * COST_CAP) / 500
+    assert outcome.cost[0, 0] == pytest.approx(cost, rel=1e-12)
+    inside = DESKTOP.in_band(np.array(states)[:fell_at, 0]).sum() / 500
+    assert outcome.score[0, 0] == pytest.approx(inside)
+    assert outcome.lost[0].tolist() == [1, 0, 0]
 
 
 def test_fractional_gaps_keep_their_mean() -> None:
@@ -319,7 +362,15 @@ def test_with_every_packet_hold_zero_and_oracle_are_the_optimal_controller() -> 
             assert outcome.cost[0, device] == pytest.approx(cost, rel=1e-9)
 
 
+class NeverOver(CartPolePlant):
+    """A pole that goes on swinging, as plants do that do not say what has fallen."""
+
+    def fallen(self, states: np.ndarray) -> np.ndarray:
+        return System.fallen(self, states)
+
+
 def test_states_are_clipped_and_nothing_ends_a_run() -> None:
+    swinging = NeverOver(**{f.name: getattr(DESKTOP, f.name) for f in dataclasses.fields(DESKTOP)})
     draws = Draws.make(protocol(steps=400), 2, seed=0)
     draws.initial[1, 1] = 49.0  # m/s, and it will be pushed further
 
@@ -333,7 +384,7 @@ def test_states_are_clipped_and_nothing_ends_a_run() -> None:
         seen.append(states[:, -1])
         return states[:, -1]
 
-    outcome = simulate(DESKTOP, draws, every_step(400, 2)[None], Shove(), sensor)
+    outcome = simulate(swinging, draws, every_step(400, 2)[None], Shove(), sensor)
     assert len(seen) == 400
     assert np.abs(seen)[:, 0, 3].max() > 10  # the pole went round
     pushed = 20 * 400 / 0.3 * 1e-3  # F t / (M + m)

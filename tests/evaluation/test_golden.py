@@ -79,7 +79,7 @@ def test_the_loop_on_true_states(name: str) -> None:
     )
     measured = np.concatenate([outcome.score.mean(axis=1), outcome.cost.mean(axis=1)])
     assert measured == pytest.approx(OUTCOMES[name], rel=1e-6)
-    assert LOOP_VERSION == 5
+    assert LOOP_VERSION == 6
 
 
 @pytest.mark.parametrize("name", PLAYED)
@@ -95,4 +95,4 @@ def test_what_controllers_play_after_one_packet(name: str) -> None:
         12,
     )
     assert errors.mean(axis=0)[[0, 1, 3, 6, 12]] == pytest.approx(PLAYED[name], abs=2e-4)
-    assert LOOP_VERSION == 5
+    assert LOOP_VERSION == 6

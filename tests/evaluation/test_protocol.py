@@ -156,6 +156,28 @@ def test_rounds_of_both_searches_are_measured_together() -> None:
     assert batches[1:] == [6, 4]
 
 
+def test_random_gaps_are_searched_where_periodic_ones_say() -> None:
+    """The grid has nothing between 1 and 20, where random gaps of 9.4 are the limit."""
+    asked: list[float] = []
+
+    class Cliff(Fake):
+        def measure(self, points: Sequence[Point], devices: int) -> Outcome:
+            asked.extend(point.gap for point in points if point.kind == "delivery")
+            limits = {"gap": 25.3, "delivery": 9.4}
+            scores = [[1 / (1 + (p.gap / limits[p.kind]) ** 9)] for p in points]
+            return Outcome(*(np.repeat(scores, devices, axis=1) for _ in range(3)))
+
+    protocol = dataclasses.replace(PROTOCOL, curve_devices=256, bracket_devices=256)
+    searches = Cliff(lambda gap: 1.0).curves(protocol).searches
+    for kind, limit in {"gap": 25.3, "delivery": 9.4}.items():
+        assert searches[kind].result().gap == pytest.approx(
+            limit * (1 / 0.62 - 1) ** (1 / 9), rel=0.03
+        )
+    searched = [gap for gap in asked if gap not in GRID]
+    assert all(7 < gap < 14 for gap in searched)  # a packet less often than every third step
+    assert len(searched) <= 6
+
+
 def test_a_wide_interval_takes_few_rounds() -> None:
     """Sixteen devices that tell nothing: the interval is the whole grid."""
     protocol = dataclasses.replace(PROTOCOL, curve_devices=16, bracket_devices=16)

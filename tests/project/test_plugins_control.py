@@ -15,6 +15,7 @@ from test_evaluate import Output, elsewhere, quick_encoder, small, untrained
 from test_model_set import of_method, saved
 
 from hjepa_cli import plugins
+from hjepa_cli.api import predict
 from hjepa_cli.compute.executors import placed
 from hjepa_cli.config.checks import check_methods, check_payload
 from hjepa_cli.config.schema import Settings
@@ -23,9 +24,10 @@ from hjepa_cli.core.evaluation import curves
 from hjepa_cli.core.evaluation.bench import Bench
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.networks.model import Model
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import ArrayError, DataError, UsageError
 from hjepa_cli.stages import evaluate, scale
 from hjepa_cli.stages.scale_by_formula import ByFormula
+from hjepa_cli.wire.export import exported_method
 
 __all__ = ["elsewhere", "quick_encoder"]  # fixtures
 
@@ -226,6 +228,24 @@ def test_a_method_that_answers_wrong_is_named(
     with pytest.raises(UsageError, match=rf"^plugin .*mine\.py: method 'mine': .*{says}") as caught:
         build_driver("mine", tiny(("mine",)), model).controller(4).act(np.ones(4, bool), z)
     assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("answer", ["z[:, :1], z", "z[:, :2], z[:1]"])
+def test_a_planner_that_answers_wrong_is_told_without_a_loop_too(
+    tmp_path: Path, checkpoint: Path, answer: str
+) -> None:
+    loaded(tmp_path, ANSWERS.replace("KIND", "'planner'").replace("PLAN", answer))
+    model = Model.load(checkpoint, "cpu")
+    with pytest.raises(ArrayError, match=r"plan\(…\) is "):
+        predict(model, torch.ones(4, model.architecture["embedding"]), 2, method="mine")
+
+
+def test_a_planner_that_no_bundle_holds_is_not_exported(tmp_path: Path, checkpoint: Path) -> None:
+    loaded(tmp_path, ANSWERS.replace("KIND", "'planner'").replace("PLAN", "z[:, :2], z"))
+    model = Model.load(checkpoint, "cpu")
+    assert "mine" in methods_of(model)
+    with pytest.raises(UsageError, match="cannot be exported as 'mine'"):
+        exported_method(model, "mine")
 
 
 def test_what_else_a_plugin_s_controller_tells_names_it_too(

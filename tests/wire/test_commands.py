@@ -54,6 +54,7 @@ def refused(shell, code, *arguments, says=()):
         (["device", "--model", "m", "--server", "127.0.0.1:1", "--key", "k"], 66, ["k does not"]),
         (["device", "--model", "m", "--watchdog-ms", "100"], 2, ["from 0 to 80"]),
         (["device", "--model", "m", "--gap-steps", "9", "--innovation", "0.1"], 2, ["two rules"]),
+        (["device", "--model", "m", "--longest", "9"], 2, ["--longest", "--innovation"]),
         (["link", "--listen", "127.0.0.1:4747"], 2, ["same address"]),
         (["link", "--uplink-loss", "1"], 2, ["less than 1"]),
         (["link", "--uplink-loss", "0.9", "--uplink-burst", "2"], 2, ["at most 0.666"]),

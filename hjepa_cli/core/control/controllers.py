@@ -41,7 +41,7 @@ class _Strides:
         self._z = torch.zeros(devices, 0)  # takes its width from the first packets
         self._forces_n = torch.zeros(devices, stride, *action_shape)
         self._phase = np.full(devices, stride)
-        self._heard = np.zeros(devices, dtype=bool)
+        self._heard, self._given_up = np.zeros(devices, dtype=bool), np.zeros(devices, dtype=bool)
         longest = REMEMBERED_STEPS + MOST_LEAD_STEPS + stride
         self._sent = SentForces(devices, longest, action_shape)
         self._later_n = torch.zeros(devices, 0, stride, *action_shape)  # strides planned already
@@ -59,7 +59,7 @@ class _Strides:
             if not self._z.shape[1]:
                 self._z = packets.new_zeros(len(delivered), packets.shape[1])
             self._z[torch.from_numpy(delivered)] = packets
-            self._heard |= delivered
+            self._heard |= delivered & ~self._given_up
         played = self._play(delivered | self._over)
         self._phase[self._heard] += 1
         if ages is not None:
@@ -83,6 +83,11 @@ class _Strides:
         strides_n = torch.cat([self._forces_n[:, None], self._later_n], 1).flatten(1, 2).numpy()
         steps = np.maximum(self._phase - 1, 0)[:, None] + np.arange(AHEAD_STEPS)
         return np.asarray(strides_n[np.arange(len(steps))[:, None], steps], dtype=np.float64)
+
+    def give_up(self, devices: Bools) -> None:
+        """Plan nothing more for these devices [n]: their forces count for nothing."""
+        self._given_up |= devices
+        self._heard &= ~devices
 
     @torch.inference_mode()
     def planned_n(self) -> Floats:

@@ -9,6 +9,9 @@ One step k of every loop, in this order:
 4. step k is scored on the state x_k and the force that is played, once the warm-up is over;
 5. the plant moves to x_{k+1} under that force and process noise.
 
+A device that has fallen, as its plant says, is over: it sends nothing more, gets no force, and each
+of its steps is out of band and costs as much as a step can.
+
 Devices N and curve points P (different link schedules on the same draws) share one simulation.
 """
 
@@ -35,7 +38,7 @@ from hjepa_cli.core.plants.frames import LONGEST, frames_seen
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import NumericalError, UsageError
 
-LOOP_VERSION = 5  # raise it whenever a measured number changes: cached curves then expire
+LOOP_VERSION = 6  # raise it whenever a measured number changes: cached curves then expire
 _DRAWS_KEY, _LINK_KEY = 0xD4A5, 0x11A7
 GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples, modulo 1, spread evenly however many are taken
 
@@ -53,7 +56,8 @@ class Controller(Protocol):
 
         One that has ``ahead_n()``, too, tells devices the forces [n, L, *A] of this step and of the
         next ones without a packet; of others a device holds the last force that reaches it. One
-        that has ``stride_steps`` is given late packets whole strides old.
+        that has ``stride_steps`` is given late packets whole strides old, and one that has
+        ``give_up(devices)`` is told of which [n] nothing will be heard again.
         """
         ...
 
@@ -420,10 +424,14 @@ def simulate(
     noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
     plants = ScoredPlants(plant, initial, mass_scale, noise, draws.warmup_steps)
     link = Link(draws.link.tiled(points), controller, delay_steps)
+    give_up = getattr(controller, "give_up", None)
     for k in range(steps):
-        states, sent = plants.states, delivered[:, k].reshape(-1)
+        states, fallen = plants.states, plants.fallen
+        sent = delivered[:, k].reshape(-1) & ~fallen
         forces_n = link.forces_n(sent, plants.sense(sensor, sent))
         watch(k, states, plants.move(forces_n))
+        if give_up and (plants.fallen > fallen).any():
+            give_up(plants.fallen)
         tick()
     means = plants.means(steps - draws.warmup_steps)
     score, cost, lost = (values.reshape(points, devices) for values in means)
@@ -455,6 +463,7 @@ class ScoredPlants:
 
     Attributes:
         states: now [N, S].
+        fallen: who is beyond help, or has been [N].
         score, cost: sums over the scored steps so far [N].
     """
 
@@ -474,19 +483,19 @@ class ScoredPlants:
         self._plants.step(plant.no_force(devices))
         self.states = self._plants.states
         self._seen = deque([*switched_on, self.states], maxlen=LONGEST)
+        self.fallen = np.asarray(plant.fallen(self.states))
         self.score, self.cost = np.zeros(devices), np.zeros(devices)
         self._step, self._warmup_steps = 0, warmup_steps
 
     @property
     def lost(self) -> Bools:
-        """Return whose state, as it is now, costs as much as a step can: bool [N].
+        """Return who has fallen, or whose state now costs as much as a step can: bool [N].
 
         The stage cost is capped (:data:`~hjepa_cli.core.plants.cost.COST_CAP`) where control has
-        lost the device: a cart-pole of plant desktop whose pole leans by more than 1.58 rad, or
-        whose cart is further than 1.58 m away.
+        lost the device: a cart-pole of plant desktop whose cart is further than 1.58 m away.
         """
         at_rest = self.plant.no_force(len(self.states))
-        return np.asarray(self.plant.cost(self.states, at_rest) >= COST_CAP)
+        return np.asarray(self.fallen | (self.plant.cost(self.states, at_rest) >= COST_CAP))
 
     def means(self, scored_steps: int) -> tuple[Floats, Floats, Floats]:
         """Return score and cost per scored step, and who is lost as 0 or 1 [N] each."""
@@ -507,13 +516,16 @@ class ScoredPlants:
         if not np.isfinite(forces_n).all():
             raise NumericalError(f"the controller's force is not finite at step {self._step}")
         forces_n = np.clip(forces_n, -self.plant.force_limit_n, self.plant.force_limit_n)
+        forces_n[self.fallen] = 0.0
         if self._step >= self._warmup_steps:
-            self.score += self.plant.in_band(self.states)
-            self.cost += self.plant.cost(self.states, forces_n)
+            self.score += self.plant.in_band(self.states) & ~self.fallen
+            cost = self.plant.cost(self.states, forces_n)
+            self.cost += np.where(self.fallen, COST_CAP, cost)
         self._plants.step(forces_n)
         moved = self._plants.states + next(self._noise)
         self._plants.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
         self.states = self._plants.states
+        self.fallen = self.fallen | self.plant.fallen(self.states)
         self._seen.append(self.states)
         self._step += 1
         return forces_n

@@ -12,7 +12,7 @@ from hjepa_cli.core.plants.frames import frames_back, frames_of
 from hjepa_cli.core.plants.system import Camera
 
 if TYPE_CHECKING:
-    from hjepa_cli.core.networks.model import Model
+    from hjepa_cli.core.networks.model import Gaze, Model
 
 SENSOR_BATCH = 256  # inputs rendered and encoded at a time: 24 MiB of four frames
 
@@ -62,13 +62,44 @@ def embedding_sensor(
 
     They are as ``send`` makes them arrive, [n, D] → [n, D]; without it those that the device has.
     """
-    look = camera_sensor(model, camera)
+    eyes = Eyes(model, camera)
 
     def sense(seen: Floats | Pixels) -> Tensor:
         received = []
         for start in range(0, len(seen), SENSOR_BATCH):
-            z = model.encode(look(seen[start : start + SENSOR_BATCH]))
+            z = eyes.encode(seen[start : start + SENSOR_BATCH])
             received.append(send(z) if send else z)
         return torch.cat(received).to(model.device)
 
     return sense
+
+
+class Eyes:
+    """They encode what devices see: the same, up to rounding, sooner where all send at every step.
+
+    Then all pictures but one were there a step ago. A camera that has ``film`` takes those of a
+    packet together, and all anew.
+    """
+
+    def __init__(self, model: "Model", camera: Camera | None = None) -> None:
+        self._model, self._camera = model, camera or model.camera
+        self._look, self._back = camera_sensor(model, camera), frames_back(*model.look)
+        self._films = hasattr(self._camera, "film")
+        self._states = np.zeros((0, 0, 0))
+        self._gaze: Gaze | None = None
+
+    def encode(self, seen: Floats | Pixels) -> Tensor:
+        """Return the embeddings [m, D] of the last states [m, 16, S] or frames."""
+        states = seen[:, self._back]
+        if is_pixels(states) or self._films:
+            return self._model.encode(self._look(seen))
+        again = np.array_equal(states[:, :-1], self._states[:, 1:])
+        self._states = states
+        if not again or "decoder" in self._model.networks:
+            self._gaze = None
+            return self._model.encode(self._look(seen))
+        if self._gaze is None:
+            self._gaze = self._model.gaze(self._look(seen))
+        else:
+            self._gaze.go_on(frames_of(self._camera, states[:, -1:], SENSOR_BATCH))
+        return self._gaze.embeddings()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core import statistics
-from hjepa_cli.core.arrays import Floats, Pixels
+from hjepa_cli.core.arrays import Floats, Pixels, check_answer
 from hjepa_cli.core.control.drivers import Driver
 from hjepa_cli.core.control.sensors import retaken
 from hjepa_cli.core.evaluation.bench import control_entry
@@ -127,7 +127,9 @@ def latent_errors(
     forces = torch.from_numpy(np.asarray(recorded.actions)).float()
     now, missed, still = z[:, 0], [], []
     for step in steps:
-        now = planner.follow(now, forces[:, step - planner.stride : step], ages).float().cpu()
+        moved = planner.follow(now, forces[:, step - planner.stride : step], ages)
+        check_answer(moved, now.shape, "follow(…)", Tensor)
+        now = moved.float().cpu()
         truth = z[:, step]
         missed.append(1 - torch.cosine_similarity(now, truth, dim=-1))
         still.append(1 - torch.cosine_similarity(z[:, 0], truth, dim=-1))

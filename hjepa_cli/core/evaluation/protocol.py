@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core import statistics
@@ -23,6 +24,9 @@ BESIDE = ("in_band", "lq_ratio", "lost")  # what a point of a curve has beside i
 KINDS = ("gap", "delivery")
 STEP_OUT = 4  # brackets that a search goes outwards at a time, until the interval is inside
 MAX_GUESSES = 4  # rounds of a search that go by guessing, before it bisects
+WIDE = 4.0  # the ends of a bracket so far apart tell little of what lies between them
+CLIFF = 0.05  # that scores fall by over a bracket's width, several times what chance makes
+SPREAD = 2.7  # D* ÷ the mean gap at p*, about: of random gaps the longest decide
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,16 +129,22 @@ class Search:
         few: their outcomes with few devices.
         reference: the teacher with many devices.
         protocol: acceptable score, bracket width and devices.
+        periodic: of a search over random gaps the one over periodic gaps, which says where to look.
     """
 
     def __init__(
-        self, grid: Sequence[Point], few: Outcome, reference: Reference, protocol: ProtocolSettings
+        self,
+        grid: Sequence[Point],
+        few: Outcome,
+        reference: Reference,
+        protocol: ProtocolSettings,
+        periodic: "Search | None" = None,
     ) -> None:
         self.kind, self._log = grid[0].kind, grid[0].kind == "delivery"
         scores = reference.relative_score(few).tolist()
         self._grid = dict(zip((point.gap for point in grid), scores, strict=True))
         self._measured: dict[float, Outcome] = {}
-        self._reference = reference
+        self._reference, self._periodic = reference, periodic
         self._acceptable, self._bracket = protocol.acceptable_score, protocol.bracket
         self._step_out = 1 + STEP_OUT * protocol.bracket
         self._rounds = 0
@@ -156,6 +166,11 @@ class Search:
     def add(self, point: Point, outcome: Outcome) -> None:
         """Take the outcome of a point with many devices [1, N]."""
         self._measured[point.gap] = outcome
+
+    def guess(self) -> float | None:
+        """Return about where the crossing is; ``None`` if the grid does not have it."""
+        left, right = _bracket(scores := self._scores(), self._acceptable)
+        return left and right and self._guess(left, right, scores)
 
     def wanted(self) -> list[Point]:
         """Return the next points to measure with many devices; none when the search is over."""
@@ -179,11 +194,15 @@ class Search:
         gap, low, high = (ends.get(value, value) for value in (crossing, low, high))
         return Tolerance(gap, (low, high), crossing == math.inf)
 
+    def _scores(self) -> dict[float, float]:
+        """Return all scores by gap, with many devices where these are measured."""
+        if not self._measured:
+            return self._grid
+        measured = self._reference.relative_score(self.outcome).tolist()
+        return self._grid | dict(zip(sorted(self._measured), measured, strict=True))
+
     def _next(self) -> Sequence[float]:
-        scores = dict(self._grid)
-        if self._measured:
-            measured = self._reference.relative_score(self.outcome).tolist()
-            scores |= zip(sorted(self._measured), measured, strict=True)
+        scores = self._scores()
         left, right = _bracket(scores, self._acceptable)
         if left is not None and right is not None and right / left - 1 > self._bracket:
             return self._between(left, right, scores)
@@ -232,13 +251,26 @@ class Search:
         return [gap for gap in (guess / half, guess * half) if left < gap < right]
 
     def _guess(self, left: float, right: float, scores: Mapping[float, float]) -> float:
-        """Return the crossing on a line between the ends, unless just one of them is measured.
+        """Return about where the crossing is.
 
-        Then the line goes through that one, with the grid's slope: few devices tell how steep a
-        curve is better than how high.
+        Beside a cliff it is on a line up its face. Random gaps with ends that are far apart are at
+        first searched where periodic ones say. Otherwise scores over random gaps bend, and it is
+        where a monotone cubic through all of them crosses; over periodic gaps it is on a line
+        between the ends, unless just one of them is measured: then the line goes through that one,
+        with the grid's slope. Few devices tell how steep a curve is better than how high.
         """
+        beside = self._up_the_cliff(right, scores)
+        if beside is None and self._periodic and right / left > WIDE and self._rounds <= 2:
+            beside = (self._periodic.guess() or 0.0) / SPREAD
+        if beside is not None and left < beside < right:
+            return beside
+        if self._log:
+            gaps = sorted(scores)
+            curve = PchipInterpolator(np.log(gaps), [scores[gap] for gap in gaps])
+            crossings = np.exp(curve.solve(self._acceptable, extrapolate=False))
+            inside = crossings[(left <= crossings) & (crossings <= right)]
+            return float(inside[0]) if len(inside) else self._middle(left, right)
         known = [gap for gap in (left, right) if gap in self._measured]
-        to, back = (math.log, math.exp) if self._log else (float, float)
         through, drop = left, scores[left] - scores[right]
         if len(known) == 1:
             of_few = np.interp((left, right), list(self._grid), list(self._grid.values()))
@@ -246,7 +278,18 @@ class Search:
         if drop <= 0:
             return self._middle(left, right)
         steps = (scores[through] - self._acceptable) / drop
-        return back(min(to(through) + steps * (to(right) - to(left)), to(max(self._grid))))
+        return min(through + steps * (right - left), max(self._grid))
+
+    def _up_the_cliff(self, right: float, scores: Mapping[float, float]) -> float | None:
+        """Return the crossing on a line through two close points that begin at ``right``.
+
+        ``None`` where scores fall too little between them to tell a slope from chance.
+        """
+        close = right * (1 + 2 * self._bracket)
+        pair = [gap for gap in sorted(scores) if right <= gap <= close][:2]
+        if len(pair) < 2 or (drop := scores[pair[0]] - scores[pair[1]]) < CLIFF:
+            return None
+        return pair[0] - (self._acceptable - scores[pair[0]]) / drop * (pair[1] - pair[0])
 
     def _middle(self, left: float, right: float) -> float:
         return math.sqrt(left * right) if self._log else (left + right) / 2
@@ -295,7 +338,7 @@ def measure_curves(
         parts = [first, *([outcome.part(rows)] if outcome else [])]
         points, joined = [Point(kind, gap) for gap in gaps], Outcome.joined(parts, axis=0)
         grid[kind] = (points, joined)
-        searches[kind] = Search(points, joined, reference, protocol)
+        searches[kind] = Search(points, joined, reference, protocol, searches.get("gap"))
     while wanted := [point for search in searches.values() for point in search.wanted()]:
         outcome = measure(wanted, protocol.bracket_devices)
         for row, point in enumerate(wanted):

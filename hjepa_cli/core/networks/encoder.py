@@ -220,12 +220,31 @@ class Encoder(nn.Module):
         are fitted to their background are float32, and rounded where networks compute in bfloat16,
         but their differences before that.
         """
-        few = len(frames)
-        if frames.device.type == "cpu":
-            few = max(CACHED_VALUES // math.prod(frames.shape[1:]), 1)
-        parts = [self._inputs(part) for part in torch.split(frames, few or 1)]
+        parts = [self._inputs(part) for part in torch.split(frames, _few(frames))]
         # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.
         return torch.cat(parts).permute(0, 3, 1, 2)
+
+    def next_inputs(self, x: Tensor, last: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what :meth:`inputs` does of packets a step later, sooner: one picture is new.
+
+        Args:
+            x: what the network saw a step ago [N, Cκ, H, W].
+            last: the pictures that were new then, fitted to their background [N, H, W, C].
+            frames: those that are now, uint8 [N, 1, H, W, C].
+
+        Returns:
+            The inputs, and the new pictures fitted to their background.
+        """
+        colours, x = frames.shape[-1], x.permute(0, 2, 3, 1)
+        seen, now = torch.empty_like(x), torch.empty_like(last)
+        few = (torch.split(part, _few(frames)) for part in (x, last, frames, seen, now))
+        for before, earlier, new, into, fitted in zip(*few, strict=True):
+            fitted.copy_(self.fitted(new)[0])
+            fresh, kept = [fitted], before[..., :-colours]
+            if self.frame_input == "difference":
+                fresh, kept = [fitted, fitted - earlier], before[..., colours:-colours]
+            torch.cat([*(part.to(x.dtype) for part in fresh), kept], dim=-1, out=into)
+        return seen.permute(0, 3, 1, 2), now
 
     def _inputs(self, frames: Tensor) -> Tensor:
         """Return the inputs of a few frames, [N, H, W, Cκ]."""
@@ -248,6 +267,14 @@ class Encoder(nn.Module):
             return [frame.float() for frame in reversed(frames.unbind(1))]
         fitted = against_background(frames.flatten(0, 1), self.photometric)
         return [*reversed(fitted.view(frames.shape).unbind(1))]
+
+
+def _few(frames: Tensor) -> int:
+    """Return how many packets of frames [N, κ, H, W, C] to take at a time."""
+    few = len(frames)
+    if frames.device.type == "cpu":
+        few = max(CACHED_VALUES // math.prod(frames.shape[1:]), 1)
+    return few or 1
 
 
 def _fold(module: nn.Module, convolution: str, norm: str) -> None:

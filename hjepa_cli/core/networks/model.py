@@ -335,6 +335,10 @@ class Model:
             precision=self.precision,
         )
 
+    def gaze(self, frames: NDArray[np.uint8]) -> "Gaze":
+        """Return what looks at the same devices step after step, first at these frames."""
+        return Gaze(self, frames)
+
     def act(self, z: Tensor, network: str = "actor") -> Tensor:
         """Answer embeddings [N, D] with forces ÷ force limit [N, *A], clipped to ±1.
 
@@ -358,3 +362,39 @@ class Model:
     def autocast(self) -> AbstractContextManager[object]:
         """Compute in the precision that the networks were trained in."""
         return autocast(self.device, self.precision)
+
+
+class Gaze:
+    """Devices are looked at step after step: all pictures but one are those of the step before.
+
+    Args:
+        model: encodes, without a decoder in between.
+        frames: uint8 [N, κ, H, W, C] of the first step.
+    """
+
+    @torch.inference_mode()
+    def __init__(self, model: Model, frames: NDArray[np.uint8]) -> None:
+        self._model = model
+        pictures = torch.from_numpy(frames).to(model.device)
+        with model.autocast():
+            self._x = self._encoder.inputs(pictures)
+            (self._last,) = self._encoder.fitted(pictures[:, -1:])
+
+    @torch.inference_mode()
+    def go_on(self, frames: NDArray[np.uint8]) -> None:
+        """Look at the pictures of the next step, uint8 [N, 1, H, W, C]."""
+        pictures = torch.from_numpy(frames).to(self._model.device)
+        with self._model.autocast():
+            self._x, self._last = self._encoder.next_inputs(self._x, self._last, pictures)
+
+    @torch.inference_mode()
+    def embeddings(self) -> Tensor:
+        """Return what :meth:`Model.encode` does, but for rounding: float32 [N, D] on the CPU."""
+        with self._model.autocast():
+            return self._encoder.embed(self._x).float().cpu()
+
+    @property
+    def _encoder(self) -> Encoder:
+        encoder = self._model.networks["encoder"]
+        assert isinstance(encoder, Encoder)
+        return encoder

@@ -34,7 +34,7 @@ def against_background(frames: Tensor, fit: str) -> Tensor:
     """
     level, width = _background(frames), frames.shape[2]
     # A row of pixels is one run in memory: what is the same for all of them costs least along it.
-    apart = frames.float().flatten(2) - level.repeat(1, width)[:, None]
+    apart = frames.to(torch.float32, copy=True).flatten(2).sub_(level.repeat(1, width)[:, None])
     if fit == "gain":
         factor = WHITE / level.clamp_min(LEAST)
     else:

@@ -203,6 +203,13 @@ class System(abc.ABC):
     def cost(self, states: Floats, forces_n: Floats) -> Floats:
         """Return a step's quadratic cost; see :func:`hjepa_cli.core.plants.cost.stage_cost`."""
 
+    def fallen(self, states: Floats) -> Bools:
+        """Say which states ``[..., S]`` no force brings back, ``[...]``: a loop there is over.
+
+        It does not have to name them all, and by default names none.
+        """
+        return np.zeros(states.shape[:-1], bool)
+
     def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
         """Return the states ``[..., S]`` whose pictures are those of ``states``, moved right.
 

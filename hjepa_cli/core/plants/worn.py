@@ -91,6 +91,10 @@ class Worn(System):
         """Return the plant's cost."""
         return self._kind.cost(states, forces_n)
 
+    def fallen(self, states: Floats) -> Bools:
+        """Say what the plant does."""
+        return self._kind.fallen(states)
+
     def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
         """Return the plant's."""
         return self._kind.sideways(states, shift_px)

@@ -42,6 +42,10 @@ class CartPolePlant(CartPoleParameters, System):
         """Return the capped quadratic cost with the teacher's weights."""
         return stage_cost(states, forces_n, self.state_weights, self.force_weight)
 
+    def fallen(self, states: Floats) -> Bools:
+        """Say whether the pole is level or below: on a machine it would lie on the track."""
+        return np.abs(states[..., 2]) >= np.pi / 2
+
     def sideways(self, states: Floats, shift_px: ArrayLike) -> Floats:
         """Move x only: the track looks the same everywhere."""
         moved = np.array(states, float)
