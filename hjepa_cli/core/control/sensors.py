@@ -85,7 +85,7 @@ class Eyes:
         self._model, self._camera = model, camera or model.camera
         self._look, self._back = camera_sensor(model, camera), frames_back(*model.look)
         self._films = hasattr(self._camera, "film")
-        self._states = np.zeros((0, 0, 0))
+        self._states: Floats | Pixels = np.zeros((0, 0, 0))
         self._gaze: Gaze | None = None
 
     def encode(self, seen: Floats | Pixels) -> Tensor:

@@ -332,7 +332,8 @@ def measure_curves(
     later = [Point(kind, gap) for kind in KINDS for gap in gaps[1:]]
     outcome = measure(later, protocol.curve_devices) if later else None
     first = every_step()
-    grid, searches = {}, {}
+    grid: dict[str, tuple[list[Point], Outcome]] = {}
+    searches: dict[str, Search] = {}
     for number, kind in enumerate(KINDS):
         rows = slice(number * (len(gaps) - 1), (number + 1) * (len(gaps) - 1))
         parts = [first, *([outcome.part(rows)] if outcome else [])]
