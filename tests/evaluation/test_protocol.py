@@ -178,6 +178,31 @@ def test_random_gaps_are_searched_where_periodic_ones_say() -> None:
     assert len(searched) <= 6
 
 
+def test_the_interval_s_end_is_looked_for_where_no_point_is_near() -> None:
+    """Devices differ, so that the interval of random gaps ends between 1 and what was searched."""
+
+    class Cliff(Fake):
+        def measure(self, points: Sequence[Point], devices: int) -> Outcome:
+            limits = {"gap": 25.3, "delivery": 9.4}
+            at = np.array([[point.gap / limits[point.kind]] for point in points])
+            scores = 1 / (1 + (at * np.exp(self.offsets[:devices])) ** 9)
+            return Outcome(scores, scores, scores)
+
+    protocol = dataclasses.replace(PROTOCOL, curve_devices=64, bracket_devices=64)
+    fake = Cliff(lambda gap: 1.0, spread=0.4)
+    search = fake.curves(protocol).searches["delivery"]
+    low = search.result().interval[0]
+    gaps = [point.gap for point in search.points]
+    near = max(gap for gap in gaps if gap <= low), min(gap for gap in gaps if gap > low)
+    assert 4 < near[0] and near[1] / near[0] < 1.5
+    # Where curves are measured as finely as one likes, their replicates cross there, too.
+    fine = np.geomspace(3, 20, 400)
+    scores = fake.measure([Point("delivery", gap) for gap in fine], 64).score
+    weights = np.random.default_rng(1).multinomial(64, np.full(64, 1 / 64), 2000) / 64
+    crossings = [fine[np.argmax(curve < 0.62)] for curve in weights @ scores.T]
+    assert low == pytest.approx(np.quantile(crossings, 0.025), rel=0.04)
+
+
 def test_a_wide_interval_takes_few_rounds() -> None:
     """Sixteen devices that tell nothing: the interval is the whole grid."""
     protocol = dataclasses.replace(PROTOCOL, curve_devices=16, bracket_devices=16)

@@ -210,13 +210,19 @@ class Search:
         return ends or self._next_for_interval()
 
     def _next_for_interval(self) -> Sequence[float]:
-        """Widen the measured range until the interval lies inside it, in steps that double."""
-        first, last = min(self._measured), max(self._measured)
+        """Widen the measured range until the interval lies inside it, in steps that double.
+
+        An end that lies where no point is near was only interpolated, and is looked for likewise.
+        """
+        last = max(self._measured)
         low, high = self._interval()
         wider = []
-        if low == -math.inf:
+        above = min((gap for gap in self._measured if gap > low), default=last)
+        below = max((gap for gap in self._measured if gap <= low), default=above)
+        if low == -math.inf or above / below > WIDE:
             self._steps_down *= 2
-            wider.append(max(first / self._step_out ** (self._steps_down / 2), min(self._grid)))
+            step = self._step_out ** (self._steps_down / 2)
+            wider.append(max(above / step, min(self._grid)))
         if high == math.inf:
             self._steps_up *= 2
             wider.append(min(last * self._step_out ** (self._steps_up / 2), max(self._grid)))
