@@ -29,7 +29,7 @@ from hjepa_cli.storage.runs import Run
 from hjepa_cli.storage.zoo import CURVES_FILE
 
 MIN_TEACHER_SCORE = 0.85  # below, a protocol judges the plant more than the methods
-USUAL_ROUNDS = 5  # of the search for tolerances, for the progress bar
+USUAL_ROUNDS = 2  # of the search for tolerances, for the progress bar
 
 
 def plan_curves(
@@ -52,7 +52,8 @@ def plan_curves(
 
 def seconds_of_curves(methods: Sequence[str], protocol: ProtocolSettings) -> float:
     """Return about how long it takes to measure the curves of some methods."""
-    packets = 2 * protocol.curve_devices * protocol.total_steps * sum(1 / d for d in protocol.gaps)
+    rate = 0.5 + 2 * sum(1 / d for d in protocol.gaps[1:])  # two methods share the first point
+    packets = rate * protocol.curve_devices * protocol.total_steps
     frames = {"closed-loop frames": sum(map(needs_model, methods)) * packets}
     return seconds_of_loops(methods, _usual_device_steps(protocol)) + seconds_of(frames)
 

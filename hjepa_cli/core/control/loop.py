@@ -398,6 +398,7 @@ def simulate(
     sensor: Sensor,
     *,
     delay_steps: int = 0,
+    ends: bool = True,
     tick: Callable[[], None] = lambda: None,
     watch: Callable[[int, Floats, Floats], None] = lambda k, states, forces_n: None,
 ) -> Outcome:
@@ -410,6 +411,7 @@ def simulate(
         controller: drives P · N devices, point by point; in its initial state.
         sensor: turns states into packets.
         delay_steps: how long a packet is under way besides what the draws say of it.
+        ends: whether a device that has fallen is over.
         tick: called after every step, for progress.
         watch: called at every step with k, states [P · N, S] and applied forces [P · N, *A].
 
@@ -422,7 +424,7 @@ def simulate(
         np.tile(drawn, (points, 1)) for drawn in (draws.initial, draws.mass_scale)
     )
     noise = (np.tile(drawn, (points, 1)) for drawn in draws.noise)
-    plants = ScoredPlants(plant, initial, mass_scale, noise, draws.warmup_steps)
+    plants = ScoredPlants(plant, initial, mass_scale, noise, draws.warmup_steps, ends=ends)
     link = Link(draws.link.tiled(points), controller, delay_steps)
     give_up = getattr(controller, "give_up", None)
     for k in range(steps):
@@ -460,6 +462,7 @@ class ScoredPlants:
         mass_scale: of each device [N, 2].
         noise: added to the states [N, S] after one step after the other.
         warmup_steps: how many steps go by before scores and costs are summed.
+        ends: whether a device that has fallen is over.
 
     Attributes:
         states: now [N, S].
@@ -474,16 +477,19 @@ class ScoredPlants:
         mass_scale: Floats,
         noise: Iterator[Floats],
         warmup_steps: int = 0,
+        *,
+        ends: bool = True,
     ) -> None:
         devices = len(initial)
-        self.plant, self._noise = plant, noise
+        self.plant, self._noise, self._ends = plant, noise, ends
         self._plants = plant.simulation(devices, mass_scale=mass_scale)
         self._plants.states = initial
         switched_on = [self._plants.states] * (LONGEST - 1)
         self._plants.step(plant.no_force(devices))
         self.states = self._plants.states
         self._seen = deque([*switched_on, self.states], maxlen=LONGEST)
-        self.fallen = np.asarray(plant.fallen(self.states))
+        self.fallen = np.zeros(devices, dtype=bool)
+        self._see_who_fell()
         self.score, self.cost = np.zeros(devices), np.zeros(devices)
         self._step, self._warmup_steps = 0, warmup_steps
 
@@ -496,6 +502,10 @@ class ScoredPlants:
         """
         at_rest = self.plant.no_force(len(self.states))
         return np.asarray(self.fallen | (self.plant.cost(self.states, at_rest) >= COST_CAP))
+
+    def _see_who_fell(self) -> None:
+        if self._ends:
+            self.fallen = self.fallen | self.plant.fallen(self.states)
 
     def means(self, scored_steps: int) -> tuple[Floats, Floats, Floats]:
         """Return score and cost per scored step, and who is lost as 0 or 1 [N] each."""
@@ -525,7 +535,7 @@ class ScoredPlants:
         moved = self._plants.states + next(self._noise)
         self._plants.states = np.clip(moved, -STATE_LIMIT, STATE_LIMIT)
         self.states = self._plants.states
-        self.fallen = self.fallen | self.plant.fallen(self.states)
+        self._see_who_fell()
         self._seen.append(self.states)
         self._step += 1
         return forces_n

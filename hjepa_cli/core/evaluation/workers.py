@@ -154,15 +154,15 @@ class Workers:
     def each(
         self, drive: Callable[[J], R], jobs: Iterable[J]
     ) -> Generator[tuple[J, R], None, None]:
-        """Drive one job more at a time than there are workers, each in a thread of its own.
+        """Drive about twice as many jobs at a time as there are workers, each in its own thread.
 
-        A job is a search that asks for units step by step: while one thinks, the units of another
-        are computed. Yields jobs and their results as they are ready. The first error ends it; of
-        what is ready by then nothing is lost.
+        A job is a search that asks for units step by step: while one waits for the only one that it
+        can ask for, the units of others are computed. Yields jobs and their results as they are
+        ready. The first error ends it; of what is ready by then nothing is lost.
         """
         left, flying = iter(jobs), dict[Future[R], J]()
         while True:
-            for job in itertools.islice(left, max(self.count + 1 - len(flying), 0)):
+            for job in itertools.islice(left, max(2 * self.count + 1 - len(flying), 0)):
                 flying[_in_thread(drive, job)] = job
             if not flying:
                 return
