@@ -169,6 +169,19 @@ def test_a_fallen_device_is_over() -> None:
     assert outcome.lost[0].tolist() == [1, 0, 0]
 
 
+def test_a_fallen_device_goes_on_where_a_simulation_says_so() -> None:
+    heard: list[np.ndarray] = []
+
+    class Pushes:
+        def act(self, delivered: np.ndarray, packets: Any) -> np.ndarray:
+            heard.append(delivered.copy())
+            return np.full(2, 20.0)
+
+    draws = Draws.make(protocol(steps=400), 2, seed=0)
+    simulate(DESKTOP, draws, every_step(400, 2)[None], Pushes(), true_state, ends=False)
+    assert np.array(heard).all()
+
+
 def test_fractional_gaps_keep_their_mean() -> None:
     schedule = gap_schedule(2.6, 2600, 1)
     assert schedule.sum() == 1000
