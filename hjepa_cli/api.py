@@ -99,6 +99,8 @@ def drive(
 ) -> dict[str, Floats]:
     """Drive some devices in closed loop over one link and return what happened.
 
+    One that has fallen, as its plant says, sends nothing more and gets no force.
+
     Args:
         method: as on the command line; those on embeddings need ``model``. Packets of ``hold+9``
             come 9 steps later than the settings' ``protocol.delay_steps`` say; ``hjepa`` takes

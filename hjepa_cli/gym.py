@@ -2,8 +2,8 @@
 
 Importing this module registers ``hjepa/CartPole-v0`` (the agent sees the state) and
 ``hjepa/CartPolePixels-v0`` (it sees the camera). Starts, process noise and length are those of the
-closed loop of ``--protocol paper``; only here an episode ends when the pole has fallen or the
-cart has left the picture, because agents learn little from a pole on the floor.
+closed loop of ``--protocol paper``, which is over for a pole that has fallen; here an episode also
+ends when the cart has left the picture, because agents learn little there.
 """
 
 import math

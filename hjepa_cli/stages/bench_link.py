@@ -373,7 +373,9 @@ def simulated(
         states[k] = now
 
     controller = StrideController(planner, draws.devices, action_shape=plant.action_shape)
-    outcome = simulate(plant, draws, sent[None], controller, sense, tick=tick, watch=watch)
+    outcome = simulate(
+        plant, draws, sent[None], controller, sense, ends=False, tick=tick, watch=watch
+    )  # as on the wire, where nobody takes a device that fell away
     return outcome.score[0]
 
 

@@ -320,6 +320,7 @@ def film(
             link.sent[None],
             believer,
             method.sensor,
+            ends=False,  # it is watched to the end
             tick=bar.advance,
             watch=lambda k, now, forces_n: states.append(now.copy()),
         )

@@ -149,7 +149,8 @@ def _without_packets(
     longest = min(longest, protocol.total_steps - 1)
     wanted = sorted({1, 2, longest, *np.geomspace(4, longest, 20).astype(int).tolist()})
     ages = [age for age in wanted if age <= longest]
-    plants = ScoredPlants(plant, *streamed_draws(protocol, devices, seed))
+    # Forces err on after a fall, too, and what is calibrated is how far.
+    plants = ScoredPlants(plant, *streamed_draws(protocol, devices, seed), ends=False)
     controller: Any = method.controller(devices)
     everybody, nobody = np.ones(devices, dtype=bool), np.zeros(devices, dtype=bool)
     plants.move(controller.act(everybody, plants.sense(method.sensor, everybody)))
