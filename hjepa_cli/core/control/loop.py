@@ -10,7 +10,7 @@ One step k of every loop, in this order:
 5. the plant moves to x_{k+1} under that force and process noise.
 
 A device that has fallen, as its plant says, is over: it sends nothing more, gets no force, and each
-of its steps is out of band and costs as much as a step can.
+of its steps is out of band and costs as much as a step can. With ``ends=False`` it goes on.
 
 Devices N and curve points P (different link schedules on the same draws) share one simulation.
 """

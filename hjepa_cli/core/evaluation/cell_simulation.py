@@ -2,7 +2,8 @@
 
 Step by step as in :mod:`hjepa_cli.core.control.loop`, but who gets through is decided while it
 runs. Cameras and encoders run only for devices that send, and for those that a reporting scheduler
-has look. Memory does not grow with the number of slots.
+has look. A device that has fallen gets no force and scores nothing, as there, but goes on sending:
+nobody tells the base station. Memory does not grow with the number of slots.
 """
 
 import dataclasses
