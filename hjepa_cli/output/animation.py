@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from hjepa_cli.core.arrays import Floats, Pixels
+from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
 from hjepa_cli.core.plants.system import Camera, System
 from hjepa_cli.errors import StorageError, UsageError, require
@@ -173,11 +173,6 @@ class Pictures:
                 left += 8
             draw.text((left, top), text, FAINT, TEXT)
             left += TEXT.getlength(text) + 18
-
-    def frame(self, shot: Film, device: int, k: int) -> Pixels:
-        """Return what the camera sees, uint8 [H, W, C]."""
-        (frame,) = self._camera.render(shot.states[k, device][None])
-        return frame
 
     def scenes(self, shot: Film, device: int, k: int) -> tuple[Image.Image, Image.Image]:
         """Return what is shown of the true and of the believed plant, in a frame's pixels.

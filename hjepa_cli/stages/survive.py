@@ -269,7 +269,7 @@ class Survivals:
             "method": method,
             "interval_steps": interval,
             "bits_per_transmission": bits,
-            "points": [described(gap, outcomes[gap], trial) for gap in curve.gaps.tolist()],
+            "points": [described(gap, outcomes[gap]) for gap in curve.gaps.tolist()],
             "splitting": [{"gap_steps": gap, "p": p, "sd_ln_p": sd} for gap, p, sd in rare],
             "levels": levels_of(curve, rare, interval),
         }
@@ -426,7 +426,7 @@ def _where(gaps: np.ndarray[Any, Any], logs: np.ndarray[Any, Any], wanted: float
     return float(gaps[at - 1] + (wanted - logs[at - 1]) / rise * (gaps[at] - gaps[at - 1]))
 
 
-def described(gap: int, outcome: Silences, trial: Trial) -> Row:
+def described(gap: int, outcome: Silences) -> Row:
     """Return a point of a curve as printed."""
     lost, loops = int(outcome.lost.sum()), outcome.lost.size
     low, high = survival.clopper_pearson(lost, loops)

@@ -244,7 +244,7 @@ class Controller:
             kind, device = protocol.peek(data)
             if kind == protocol.HELLO:
                 return self._greet(data, address, now_s)
-            return self._take(kind, device, data, address, now_s)
+            return self._take(device, data, address, now_s)
         except protocol.OtherVersion as error:
             return self._refuse_version(data, error.args[0], address, now_s)
         except protocol.Malformed:
@@ -320,9 +320,7 @@ class Controller:
             self.counts["refused"] += 1
         return [(self._answer(hello.device, hello.nonce, server_nonce, reason), address)]
 
-    def _take(
-        self, kind: int, device: int, data: bytes, address: Address, now_s: float
-    ) -> Outgoing:
+    def _take(self, device: int, data: bytes, address: Address, now_s: float) -> Outgoing:
         """Take a datagram of a session; what is old, doubled or foreign changes nothing."""
         session = self._session_of(device, data)
         if session is None:

@@ -246,12 +246,10 @@ class Device:
 class EverySteps:
     """It sends every so many steps, from step 0 on."""
 
-    looks = False
-
     def __init__(self, gap_steps: int) -> None:
         self._gap = gap_steps
 
-    def due(self, step: int, error: float | None) -> bool:
+    def due(self, step: int) -> bool:
         """Say whether to send in a step."""
         return step % self._gap == 0
 
@@ -267,7 +265,6 @@ class OnInnovation:
         longest_steps: between datagrams.
     """
 
-    looks = True
     LOOK_STEPS = 8
 
     def __init__(self, threshold: float, longest_steps: int) -> None:

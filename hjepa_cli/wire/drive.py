@@ -127,7 +127,7 @@ class Drive:
             z = self._runtime.encode(self._camera.frames)
             due = rule.due(k, self._error(k, z))
         else:
-            due = rule.due(k, None)
+            due = rule.due(k)
             if not (due or new):
                 return False
             z = self._runtime.encode(self._camera.frames)

@@ -540,7 +540,7 @@ def test_forces_are_clipped_to_the_limit():
 
 @given(st.integers(1, 50), st.integers(0, 500))
 def test_every_so_many_steps(gap, step):
-    assert EverySteps(gap).due(step, None) == (step % gap == 0)
+    assert EverySteps(gap).due(step) == (step % gap == 0)
 
 
 def test_on_innovation_it_sends_first_when_wrong_and_when_long_silent():

@@ -1,7 +1,5 @@
 """A controller's forces err by their distance from the teacher's, or a fresh packet's."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from hjepa_cli.core.arrays import Floats
@@ -14,19 +12,15 @@ def control_error(forces_n: Floats, teacher_n: Floats, force_limit_n: float) -> 
     return np.abs(forces_n - teacher_n) / (2 * force_limit_n)
 
 
-def window_means(error: Floats, windows: Sequence[tuple[int, int]] = WINDOWS) -> dict[str, Floats]:
-    """Average the control error over the windows of the horizon, both ends included.
+def window_means(error: Floats) -> dict[str, Floats]:
+    """Average the control error over :data:`WINDOWS` of the horizon, both ends included.
 
-    Args:
-        error: [..., J + 1], ``error[..., j]`` is j steps after the transmission.
-        windows: (first j, last j); windows beyond J are cut short or left out.
-
-    Returns:
-        ``{"1-20": [...], ...}``.
+    ``error[..., j]``, j = 0 … J, is j steps after the transmission; windows beyond J are cut short
+    or left out. Returns ``{"1-20": [...], ...}``.
     """
     last = error.shape[-1] - 1
     return {
         f"{first}-{end}": error[..., first : end + 1].mean(axis=-1)
-        for first, end in windows
+        for first, end in WINDOWS
         if first <= last
     }

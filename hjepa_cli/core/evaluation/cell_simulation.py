@@ -31,6 +31,7 @@ from hjepa_cli.core.radio.uplink import Access, Uplink
 
 CHUNK_STEPS = 256
 CALIBRATION_DEVICES = 39  # (39 + 1) · 0.9 is whole: the conformal quantile is exact
+LONGEST = 320  # steps without a packet that growth is calibrated over
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +123,7 @@ class Outbox:
 
 
 def measure_growth(
-    plant: System, protocol: ProtocolSettings, seed: int, method: Driver, *, longest: int = 320
+    plant: System, protocol: ProtocolSettings, seed: int, method: Driver, *, longest: int = LONGEST
 ) -> ErrorGrowthTable:
     """Calibrate a method's growth table: one packet, then the loop runs on predicted forces alone.
 
@@ -136,11 +137,11 @@ def measure_growth(
 
 
 def measure_levels(
-    plant: System, protocol: ProtocolSettings, seed: int, method: Driver, *, longest: int = 320
+    plant: System, protocol: ProtocolSettings, seed: int, method: Driver
 ) -> LevelDisagreement:
     """Calibrate the disagreement of a method's two levels; arguments as above."""
     devices = 2 * CALIBRATION_DEVICES
-    return calibrate_levels(*_without_packets(plant, protocol, seed, method, devices, longest))
+    return calibrate_levels(*_without_packets(plant, protocol, seed, method, devices, LONGEST))
 
 
 def _without_packets(
