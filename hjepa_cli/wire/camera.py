@@ -164,9 +164,8 @@ def fitted(picture: Pixels, crop: Crop | None) -> Pixels:
     x, y, width, height = crop
     part = picture[y : y + height, x : x + width]
     scale = width // WIDTH_PX
-    if part.shape[:2] != (height, width) or (height, width) != (
-        *(scale * HEIGHT_PX, scale * WIDTH_PX),
-    ):
+    whole = (height, width) == (scale * HEIGHT_PX, scale * WIDTH_PX)
+    if part.shape[:2] != (height, width) or not whole:
         raise DataError(
             f"crop {x},{y},{width},{height} of pictures of {picture.shape[1]} × "
             f"{picture.shape[0]}: it must lie inside, with a width of 128, 256, 384 … and half "

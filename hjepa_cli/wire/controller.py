@@ -296,14 +296,12 @@ class Controller:
         assert isinstance(hello, Hello)
         self.counts["hellos"] += 1
         known = hello.device in self.sessions
+        ours = self.bundle.embedding, self.bundle.axes, protocol.INT8
         reason = protocol.WELCOME
         if hello.model != self.bundle.digest:
             reason = protocol.OTHER_MODEL
             self.say(f"device {hello.device} runs another model, of plant {hello.plant}: refused")
-        elif (hello.embedding, hello.forces, hello.codec) != (
-            *(self.bundle.embedding, self.bundle.axes),
-            protocol.INT8,
-        ):
+        elif (hello.embedding, hello.forces, hello.codec) != ours:
             reason = protocol.UNSUITED
         elif not known and len(self.sessions) >= self._most:
             reason = protocol.FULL
@@ -331,11 +329,10 @@ class Controller:
             self._forget(device)
             self.counts["byes"] += 1
             return []
-        if not isinstance(message, Embedding):
-            self.counts["malformed"] += 1
-            return []
-        if (len(message.codes), len(message.forces_n)) != (
-            *(self.bundle.embedding, self.bundle.axes),
+        ours = self.bundle.embedding, self.bundle.axes
+        if (
+            not isinstance(message, Embedding)
+            or (len(message.codes), len(message.forces_n)) != ours
         ):
             self.counts["malformed"] += 1
             return []

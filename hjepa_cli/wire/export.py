@@ -7,6 +7,7 @@ that are the velocity (docs/LOG.md has what their rounding costs).
 """
 
 import contextlib
+import copy
 import hashlib
 import logging
 import math
@@ -83,11 +84,8 @@ class _Plan(nn.Module):
 
     def __init__(self, model: Model, planner: Hierarchy | OnePredictor) -> None:
         super().__init__()
-        self.networks, self.stride, self.force_limit_n = (
-            model.networks,
-            planner.stride,
-            model.force_limit_n,
-        )
+        self.networks, self.force_limit_n = model.networks, model.force_limit_n
+        self.stride = planner.stride
         self.strides = model.strides if isinstance(planner, Hierarchy) else None
         self.again = model.architecture["stride_actions"] == "all"
 
@@ -133,7 +131,7 @@ class _Act(nn.Module):
 def load_fp32(path: Path) -> Model:
     """Load a checkpoint to compute in float32 on the CPU, whatever it was trained in."""
     checkpoint = load_checkpoint(path)
-    metadata = msgspec.json.decode(msgspec.json.encode(checkpoint.metadata))
+    metadata = copy.deepcopy(checkpoint.metadata)
     Model.load(path, "cpu")  # refuses what cannot drive
     metadata["settings"]["encoder"]["precision"] = "fp32"
     return Model(load_modules(checkpoint), metadata, checkpoint.digest, "cpu")

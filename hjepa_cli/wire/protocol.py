@@ -257,10 +257,7 @@ def _answer(data: bytes) -> Answer:
 def _embedding(data: bytes) -> Embedding:
     if len(data) < _EMBEDDING.size:
         raise Malformed("length")
-    count, axes = (
-        data[_EMBEDDING.size - 4] + 256 * data[_EMBEDDING.size - 3],
-        data[_EMBEDDING.size - 2],
-    )
+    *_, count, axes, _ = _EMBEDDING.unpack_from(data)
     found = _unpack(_EMBEDDING, data, 4 * axes + count)
     _, _, _, device, step, capture_age, force_age, source, *rest = found
     number, answered, lag_steps, scale, _, _, reserved = rest
@@ -280,7 +277,7 @@ def _embedding(data: bytes) -> Embedding:
 def _forces(data: bytes) -> Forces:
     if len(data) < _FORCES.size:
         raise Malformed("length")
-    steps, axes = data[20], data[21]
+    *_, steps, axes, _ = _FORCES.unpack_from(data)
     if not 0 < steps * axes <= MOST_FORCES:
         raise Malformed("sizes")
     _, _, _, device, counter, base, first, _, _, reserved = _unpack(_FORCES, data, 4 * steps * axes)

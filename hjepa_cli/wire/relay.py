@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from hjepa_cli.compute.seeding import generator
+from hjepa_cli.core.arrays import Bools
 from hjepa_cli.core.control.loop import LinkDraws
 from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.storage import files
@@ -33,6 +34,7 @@ MOST_CLIENTS = 16_384
 SPARE_FILES = 32  # descriptors that clients' ports leave to everything else
 MOST_WAITING = 200_000  # datagrams in the relay
 LONGEST_STEPS = 2**31  # of a delay: no loop lasts so long
+QUEUE_S = 0.25  # longest wait for a rate
 LOST = "lost"
 
 
@@ -79,7 +81,7 @@ class Trace:
         delays_ms = np.array(self.delays_ms)
         return int(np.rint(np.max(delays_ms, initial=0.0, where=~np.isnan(delays_ms)) / step_ms))
 
-    def draws(self, steps: int, devices: int, step_ms: float) -> tuple[LinkDraws, Any]:
+    def draws(self, steps: int, devices: int, step_ms: float) -> tuple[LinkDraws, Bools]:
         """Return what the trace does to the datagrams of a loop, for the simulator.
 
         Every device begins at another place of it. Delays are rounded to whole steps.
@@ -138,9 +140,6 @@ class Impairment:
                 f"at most {most:g}",
                 hint="longer bursts, or none (1), which are independent losses",
             )
-
-
-QUEUE_S = 0.25  # longest wait for a rate
 
 
 class Direction:
