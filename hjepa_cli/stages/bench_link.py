@@ -47,18 +47,9 @@ from hjepa_cli.storage import zoo
 from hjepa_cli.storage.checkpoints import load_checkpoint
 from hjepa_cli.storage.files import JSON_LIMIT_BYTES, read_bytes
 from hjepa_cli.storage.runs import Run, describe_input
-from hjepa_cli.wire import protocol
+from hjepa_cli.wire import bench, protocol
 from hjepa_cli.wire.auth import NO_KEY
-from hjepa_cli.wire.bench import (
-    LOST_THETA_RAD,
-    MOST_MISSING,
-    BenchOutcome,
-    Fleet,
-    real_time,
-)
-from hjepa_cli.wire.bench import (
-    lockstep as in_lockstep,
-)
+from hjepa_cli.wire.bench import LOST_THETA_RAD, MOST_MISSING, BenchOutcome, Fleet
 from hjepa_cli.wire.bundle import Bundle, open_bundle
 from hjepa_cli.wire.controller import Controller
 from hjepa_cli.wire.export import load_fp32
@@ -72,6 +63,31 @@ KILLED_S, STOPPED_S = 0.5, 2.0  # how long harm lasts
 THETA = "theta"
 START_STEPS = 16  # of real time in which all devices send at once: none counts as missed
 COMPARED = (1, 20, 50, 100, 300, 1000)  # steps after which angles are compared
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """It is asked for as the run records it; see :func:`run`."""
+
+    devices: int
+    steps: int
+    lockstep: bool
+    period_ms: float | None
+    gap_steps: int
+    delivery: float | None
+    harm: str | None
+    backend: str
+
+    def period_s(self, step_s: float) -> float:
+        """Return what a step takes: in lockstep time is the plant's own."""
+        return step_s if self.lockstep else wall_s(self.period_ms)
+
+    def silence(self, period_s: float) -> range:
+        """Return the steps in which a harmed server says nothing, from the middle on."""
+        if self.harm is None:
+            return range(0)
+        middle, lasts_s = self.steps // 2, KILLED_S if self.harm == "kill" else STOPPED_S
+        return range(middle, middle + round(lasts_s / period_s))
 
 
 def run(
@@ -117,93 +133,31 @@ def run(
     kind = plant_of(settings)
     bundle, path, recorded = opened(settings, model, checkpoint, trace, lockstep=lockstep)
     memory.check(memory_bytes(kind, bundle, devices, steps), f"{devices} devices, {steps} steps")
-    flags = {
-        "devices": devices,
-        "steps": steps,
-        "lockstep": lockstep,
-        "period_ms": period_ms,
-        "gap_steps": gap_steps,
-        "delivery": delivery,
-        "harm": harm,
-        "backend": backend,
-    }
+    asked = Asked(devices, steps, lockstep, period_ms, gap_steps, delivery, harm, backend)
     inputs = {
         "model": describe_input(model, bundle.digest.hex()),
         "checkpoint": describe_input(path, load_checkpoint(path).digest),
         **({"trace": describe_input(trace, digest_of(trace))} if trace else {}),
     }
-    with Run.create("bench-link", out, settings.as_dict(), {**inputs, **flags}) as record:
+    with Run.create("bench-link", out, settings.as_dict(), {**inputs, **vars(asked)}) as record:
         if record.result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
             with results.showing("bench-link", record.result, record.directory):
                 show(screen, record.result)
             return record.result
-        torch.set_num_threads(1)
-        protocol_ = dataclasses.replace(settings.protocol, warmup_steps=0, steps=steps)
-        draws = Draws.make(protocol_, devices, settings.seed)
-        period_s = kind.step_s if lockstep else wall_s(period_ms)
-        sent = (
-            gap_schedule(gap_steps, steps, devices)
-            if delivery is None
-            else delivery_schedule(delivery, draws.delivery)
-        )
-        link = draws.link
-        if recorded is not None:
-            link, lost = recorded.draws(steps, devices, 1e3 * kind.step_s)
-            link = dataclasses.replace(link, lost=draws.link.lost)
-            sent &= ~lost
-        # The wire answers at once, and sends each force several times instead of deciding it early.
-        draws = dataclasses.replace(draws, link=dataclasses.replace(link, lead_steps=0))
-        runtime = Runtime(bundle, backend)
-        runtime.warm_up("encoder", "actor")
-        moved = actual_plant(settings.plant, settings.conditions)
-        camera = actual_camera(seen_as_trained(settings, bundle.manifest["camera"]))
-        late = latest_steps(link)
-        late += -late % bundle.stride  # the controller takes packets up whole strides old
-        fleet = Fleet(
-            *(bundle, runtime, moved, camera, draws, sent, NO_KEY, period_s),
-            local=harm is not None,
-            grace_steps=late + (0 if lockstep else START_STEPS),
-            lost=link.lost,
-        )
-        with screen.progress("wire", steps, "steps") as bar:
-            if lockstep:
-                servers = [
-                    Controller(bundle, runtime, NO_KEY, most_devices=devices) for _ in range(2)
-                ]
-                wired = in_lockstep(
-                    *(fleet, servers[0], link, bar.advance),
-                    silent=silence(steps, period_s, harm),
-                    restarted=servers[1] if harm == "kill" else None,
-                )
-                skipped = sum(one.counts["skipped_strides"] for one in servers)
-            else:
-                wired, skipped = drive(fleet, model, backend, harm, bar.advance)
-        if wired.missing > MOST_MISSING and harm is None:
-            raise NumericalError(
-                f"overrun: {100 * wired.missing:.2f} % of steps had no force in time (at most "
-                f"{100 * MOST_MISSING:g} %); a score would be of this machine, not of the wire",
-                hint="fewer --devices, a longer --period-ms, or a machine with less else to do",
-            )
-        states = np.empty_like(wired.states)
-        with screen.progress("simulate", steps, "steps") as bar:
-            planner = Exported(runtime, kind.action_shape) if lockstep else in_torch(bundle, path)
-            score = simulated(runtime, planner, moved, camera, draws, sent, states, bar.advance)
-        result = compared(settings, wired, score, states, kind.state_names)
-        if harm is not None:
-            result["taken_up_after_s"] = wired.driven_again_s(silence(steps, period_s, harm).stop)
+        result, skipped = measured(settings, screen, asked, bundle, path, recorded)
         result |= {
             "model": model,
             "checkpoint": path,
             "method": bundle.manifest["method"],
             "plant": bundle.plant,
             "seed": settings.seed,
-            **flags,
-            "period_ms": None if lockstep else 1e3 * period_s,
+            **vars(asked),
+            "period_ms": None if lockstep else 1e3 * wall_s(period_ms),
             "skipped_strides": skipped,
-            "downlink_loss": protocol_.downlink_loss,
-            "delay_steps": protocol_.delay_steps,
-            "jitter_steps": protocol_.jitter_steps,
+            "downlink_loss": settings.protocol.downlink_loss,
+            "delay_steps": settings.protocol.delay_steps,
+            "jitter_steps": settings.protocol.jitter_steps,
             "trace": trace,
         }
         show(screen, result)
@@ -281,6 +235,71 @@ def memory_bytes(kind: System, bundle: Bundle, devices: int, steps: int) -> floa
     """Return what draws, states of both loops, schedules and one picture of each device take."""
     values = 3 * len(kind.state_names) + 1
     return devices * (steps * (8 * values + 3) + bundle.frames * math.prod(FRAME_SHAPE))
+
+
+def measured(
+    settings: Settings,
+    screen: Screen,
+    asked: Asked,
+    bundle: Bundle,
+    checkpoint: Path,
+    recorded: Trace | None,
+) -> tuple[dict[str, Any], int]:
+    """Drive over the wire and in the simulator; return the comparison, and strides skipped."""
+    torch.set_num_threads(1)
+    kind, steps = plant_of(settings), asked.steps
+    draws, sent = drawn(settings, asked, recorded)
+    runtime = Runtime(bundle, asked.backend)
+    runtime.warm_up("encoder", "actor")
+    moved = actual_plant(settings.plant, settings.conditions)
+    camera = actual_camera(seen_as_trained(settings, bundle.manifest["camera"]))
+    late = latest_steps(draws.link)
+    late += -late % bundle.stride  # the controller takes packets up whole strides old
+    fleet = Fleet(
+        *(bundle, runtime, moved, camera, draws, sent, NO_KEY, asked.period_s(kind.step_s)),
+        local=asked.harm is not None,
+        grace_steps=late + (0 if asked.lockstep else START_STEPS),
+        lost=draws.link.lost,
+    )
+    with screen.progress("wire", steps, "steps") as bar:
+        if asked.lockstep:
+            wired, skipped = drive_in_lockstep(fleet, runtime, draws.link, asked, bar.advance)
+        else:
+            wired, skipped = drive(fleet, asked, bar.advance)
+    if wired.missing > MOST_MISSING and asked.harm is None:
+        raise NumericalError(
+            f"overrun: {100 * wired.missing:.2f} % of steps had no force in time (at most "
+            f"{100 * MOST_MISSING:g} %); a score would be of this machine, not of the wire",
+            hint="fewer --devices, a longer --period-ms, or a machine with less else to do",
+        )
+    states = np.empty_like(wired.states)
+    with screen.progress("simulate", steps, "steps") as bar:
+        exported = Exported(runtime, kind.action_shape)
+        planner = exported if asked.lockstep else in_torch(bundle, checkpoint)
+        score = simulated(runtime, planner, moved, camera, draws, sent, states, bar.advance)
+    result = compared(settings, wired, score, states, kind.state_names)
+    if asked.harm is not None:
+        silent = asked.silence(asked.period_s(kind.step_s))
+        result["taken_up_after_s"] = wired.driven_again_s(silent.stop)
+    return result, skipped
+
+
+def drawn(settings: Settings, asked: Asked, recorded: Trace | None) -> tuple[Draws, Bools]:
+    """Return the draws of both loops, and when each device sends what is not lost [K, N]."""
+    steps, devices = asked.steps, asked.devices
+    protocol_ = dataclasses.replace(settings.protocol, warmup_steps=0, steps=steps)
+    draws = Draws.make(protocol_, devices, settings.seed)
+    if asked.delivery is None:
+        sent = gap_schedule(asked.gap_steps, steps, devices)
+    else:
+        sent = delivery_schedule(asked.delivery, draws.delivery)
+    link = draws.link
+    if recorded is not None:
+        link, lost = recorded.draws(steps, devices, 1e3 * plant_of(settings).step_s)
+        link = dataclasses.replace(link, lost=draws.link.lost)
+        sent &= ~lost
+    # The wire answers at once, and sends each force several times instead of deciding it early.
+    return dataclasses.replace(draws, link=dataclasses.replace(link, lead_steps=0)), sent
 
 
 def compared(
@@ -390,25 +409,31 @@ def latest_steps(link: LinkDraws) -> int:
     return link.delay_steps + extra
 
 
-def silence(steps: int, period_s: float, harm: str | None) -> range:
-    """Return the steps in which a server that is harmed says nothing, from the middle on."""
-    if harm is None:
-        return range(0)
-    middle = steps // 2
-    return range(middle, middle + round((KILLED_S if harm == "kill" else STOPPED_S) / period_s))
-
-
-def drive(
-    fleet: Fleet, model: Path, backend: str, harm: str | None, tick: Callable[[], None]
+def drive_in_lockstep(
+    fleet: Fleet, runtime: Runtime, link: LinkDraws, asked: Asked, tick: Callable[[], None]
 ) -> tuple[BenchOutcome, int]:
+    """Drive a fleet without deadlines; return also the strides that its servers skipped."""
+    servers = [
+        Controller(fleet.bundle, runtime, NO_KEY, most_devices=asked.devices) for _ in range(2)
+    ]
+    outcome = bench.lockstep(
+        *(fleet, servers[0], link, tick),
+        silent=asked.silence(fleet.devices[0].period_s),
+        restarted=servers[1] if asked.harm == "kill" else None,
+    )
+    return outcome, sum(one.counts["skipped_strides"] for one in servers)
+
+
+def drive(fleet: Fleet, asked: Asked, tick: Callable[[], None]) -> tuple[BenchOutcome, int]:
     """Drive a fleet in real time with a server of its own; return also the strides it skipped."""
+    model, backend, harm = fleet.bundle.directory, asked.backend, asked.harm
     with contextlib.ExitStack() as things:
         opened = things.enter_context(
             contextlib.closing(open_socket(("127.0.0.1", 0), "the bench's own socket"))
         )
         servers = [things.enter_context(serving(model, backend, "127.0.0.1:0"))]
         address = servers[0].address
-        silent = silence(len(fleet.states), fleet.devices[0].period_s, harm)
+        silent = asked.silence(fleet.devices[0].period_s)
         middle, again = silent.start, silent.stop
 
         def at_step(k: int) -> None:
@@ -422,7 +447,7 @@ def drive(
             elif harm == "stop" and k == again:
                 servers[0].process.send_signal(signal.SIGCONT)
 
-        outcome = real_time(fleet, opened, address, tick=tick, at_step=at_step)
+        outcome = bench.real_time(fleet, opened, address, tick=tick, at_step=at_step)
         return outcome, servers[-1].skipped()
 
 
