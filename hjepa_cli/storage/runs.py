@@ -183,53 +183,67 @@ class Run:
     def _open(self, stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
         self.settings = files.jsonable({key: settings[key] for key in settings if key != "preset"})
         if self.path(CONFIG).exists():
-            self.resumed = True
-            recorded = read_environment(self.directory)
-            check_plugins(self.directory, recorded)
-            self.preset = recorded.get("preset")
-            if recorded["stage"] != stage:
-                raise UsageError(
-                    f"{self.directory} holds a run of '{recorded['stage']}', not of '{stage}'",
-                    hint="choose another directory with --out DIR",
-                )
-            finished = self.path(RESULT).exists()
-            try:
-                kept = load_recorded(self.preset, self.directory).as_dict()
-            except UsageError:  # it has settings that this version has not: they are differences
-                kept = read_config(self.directory) | {"preset": self.preset}
-            changed = differences(kept, settings)
-            if recorded["schema"] > 1:
-                begun_with = recorded["inputs"]
-                given = _compared(begun_with, inputs), _compared(inputs, begun_with)
-                changed += differences(*given)
-            if changed:
-                raise UsageError(
-                    f"{self.directory} holds {'a finished' if finished else 'an unfinished'} run "
-                    f"with other settings: {'; '.join(changed)}",
-                    hint=f"{self.continue_command} {'shows' if finished else 'continues'} it as it "
-                    "is; or choose another --out DIR",
-                )
-            done = recorded["inputs"]
-            further = [flag for flag in ASKED if inputs.get(flag) and not done.get(flag)]
-            if finished:
-                if further:
-                    raise UsageError(
-                        f"{self.directory} holds a run finished without --{further[0]}",
-                        hint="choose another --out DIR",
-                    )
-                self.result = read_result(self.directory)
-                return
-            if recorded["schema"] < SCHEMA:
-                seals.warn(self.path(CONFIG))
+            self._take_up(stage, settings, inputs)
+        else:
+            self._begin(stage, settings, inputs)
+
+    def _take_up(self, stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
+        """Go on with the run that is here, or read its result; refuse another one."""
+        self.resumed = True
+        recorded = read_environment(self.directory)
+        check_plugins(self.directory, recorded)
+        self.preset = recorded.get("preset")
+        if recorded["stage"] != stage:
+            raise UsageError(
+                f"{self.directory} holds a run of '{recorded['stage']}', not of '{stage}'",
+                hint="choose another directory with --out DIR",
+            )
+        finished = self.path(RESULT).exists()
+        if changed := self._changed(recorded, settings, inputs):
+            raise UsageError(
+                f"{self.directory} holds {'a finished' if finished else 'an unfinished'} run "
+                f"with other settings: {'; '.join(changed)}",
+                hint=f"{self.continue_command} {'shows' if finished else 'continues'} it as it "
+                "is; or choose another --out DIR",
+            )
+        done = recorded["inputs"]
+        further = [flag for flag in ASKED if inputs.get(flag) and not done.get(flag)]
+        if finished:
             if further:
-                done.update(dict.fromkeys(further, True))
-                files.write_json(self.path(ENVIRONMENT), recorded)
-            for name in (METRICS, EVENTS):
-                if self.path(name).exists():  # a kill may have cut the last line
-                    files.write_text(self.path(name), "".join(_whole_lines(self.path(name))))
-            self.event("resumed")
+                raise UsageError(
+                    f"{self.directory} holds a run finished without --{further[0]}",
+                    hint="choose another --out DIR",
+                )
+            self.result = read_result(self.directory)
             return
-        environment = {  # what a run depends on besides its settings
+        if recorded["schema"] < SCHEMA:
+            seals.warn(self.path(CONFIG))
+        if further:
+            done.update(dict.fromkeys(further, True))
+            files.write_json(self.path(ENVIRONMENT), recorded)
+        for name in (METRICS, EVENTS):
+            if self.path(name).exists():  # a kill may have cut the last line
+                files.write_text(self.path(name), "".join(_whole_lines(self.path(name))))
+        self.event("resumed")
+
+    def _changed(
+        self, recorded: Mapping[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, Any]
+    ) -> list[str]:
+        """Name the settings, flags and files that are others than the run was begun with."""
+        try:
+            kept = load_recorded(self.preset, self.directory).as_dict()
+        except UsageError:  # it has settings that this version has not: they are differences
+            kept = read_config(self.directory) | {"preset": self.preset}
+        changed = differences(kept, settings)
+        if recorded["schema"] > 1:
+            begun_with = recorded["inputs"]
+            given = _compared(begun_with, inputs), _compared(inputs, begun_with)
+            changed += differences(*given)
+        return changed
+
+    def _begin(self, stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
+        """Write what the run depends on, its settings last: with them it is one."""
+        environment = {  # besides its settings
             "schema": SCHEMA,
             "stage": stage,
             "inputs": inputs,
