@@ -175,13 +175,7 @@ def open_model_set(
         MissingInputError, DataError: no such file, damaged, or of another plant.
     """
     plant_of(settings)
-    path = zoo.resolve_model(checkpoint) if checkpoint else default_model(settings, screen)
-    model = Model.load(path, settings.device) if path else None
-    if model and model.plant_name != settings.plant:
-        raise DataError(
-            f"model {path} drives plant {model.plant_name}, not {settings.plant}",
-            hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
-        )
+    path, model = load_first(settings, screen, checkpoint)
     if model:
         if settings.plant == RECORDED and dataset:
             check_same_plant(model.metadata, settings, f"model {path}", dataset)
@@ -209,6 +203,24 @@ def open_model_set(
                 f"methods; {how_to_train(methods_of(other)[0], settings)} trains it on this one"
             )
     return dataclasses.replace(first, further=tuple(others))
+
+
+def load_first(
+    settings: Settings, screen: Screen, checkpoint: str | Path | None
+) -> tuple[Path | None, Model | None]:
+    """Load the model that is named, else the default one; neither where there is none.
+
+    Raises:
+        MissingInputError, DataError: no such file, damaged, or of another plant.
+    """
+    path = zoo.resolve_model(checkpoint) if checkpoint else default_model(settings, screen)
+    model = Model.load(path, settings.device) if path else None
+    if model and model.plant_name != settings.plant:
+        raise DataError(
+            f"model {path} drives plant {model.plant_name}, not {settings.plant}",
+            hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
+        )
+    return path, model
 
 
 def _embed_alike(one: Model, other: Model) -> bool:

@@ -5,24 +5,21 @@ from; what a packet costs is known all the same.
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control import link
-from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
-from hjepa_cli.errors import DataError, UsageError
+from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.plugins import CODECS
-from hjepa_cli.stages.model_set import ModelSet, default_model, under_law_of
+from hjepa_cli.stages.model_set import ModelSet, load_first, under_law_of
 from hjepa_cli.stages.scale_by_formula import ByFormula
-from hjepa_cli.storage import zoo
 from hjepa_cli.storage.runs import Run
 
 
@@ -54,13 +51,7 @@ class ByTolerance(ByFormula):
     ) -> None:
         if not tolerance_steps >= 1:
             raise UsageError(f"--tolerance-steps {tolerance_steps:g}; expected at least 1")
-        path = zoo.resolve_model(checkpoint) if checkpoint else default_model(settings, screen)
-        model = Model.load(path, settings.device) if path else None
-        if model and model.plant_name != settings.plant:
-            raise DataError(
-                f"model {path} drives plant {model.plant_name}, not {settings.plant}",
-                hint=f"add --plant {model.plant_name}, or pass another --checkpoint",
-            )
+        path, model = load_first(settings, screen, checkpoint)
         if model:
             settings = under_law_of(model, settings)
         self.models = ModelSet(settings, model, path, None)
@@ -91,9 +82,8 @@ class ByTolerance(ByFormula):
             warmup_steps=self._settings.protocol.warmup_steps,
             scored_steps=self._settings.protocol.steps,
         )
-        path: Path | None = self.models.path
         return {
-            "checkpoint": path,
+            "checkpoint": self.models.path,
             "checkpoints": {},
             "skipped": {},
             "source": f"{self._steps:g} steps between packets as stated, not measured",

@@ -38,19 +38,18 @@ from hjepa_cli.stages.frame_training import (
     steps_shown,
 )
 from hjepa_cli.stages.inputs import (
-    brought_along,
     count_frames,
     embed,
-    open_dataset,
     pictures,
     sizes_of,
 )
-from hjepa_cli.stages.plan import Plan, found
+from hjepa_cli.stages.plan import Plan
 from hjepa_cli.stages.training import (
     SPLITS,
     TrainingRun,
     open_training_data,
     plan_training,
+    planned_data,
     run_training,
     untrained,
 )
@@ -99,10 +98,7 @@ def run(
 
 def plan(settings: Settings, *, dataset: Path | None = None, out: Path | None = None) -> Plan:
     """Plan the loops of the settings' method on the dataset's frames."""
-    data, dataset_line = found(
-        "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
-    )
-    settings = brought_along(settings, data.settings, data.path) if data else settings
+    data, dataset_line, settings = planned_data(dataset, settings)
     options, frames = settings.encoder, count_frames(data, settings, *SPLITS)
     trajectories, recorded_steps = sizes_of(data, settings)["train"]
     if options.method == "jepa":

@@ -25,7 +25,7 @@ from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_fusion
 from hjepa_cli.stages.embedding_training import begin, fit_network, round_weights, save
-from hjepa_cli.stages.inputs import brought_along, open_dataset, refuse_recorded
+from hjepa_cli.stages.inputs import brought_along, refuse_recorded
 from hjepa_cli.stages.plan import Plan, found
 from hjepa_cli.stages.train_reflex import open_model
 from hjepa_cli.stages.training import (
@@ -33,6 +33,7 @@ from hjepa_cli.stages.training import (
     TrainingRun,
     open_training_data,
     plan_training,
+    planned_data,
     run_training,
 )
 from hjepa_cli.storage.checkpoints import Checkpoint
@@ -76,10 +77,7 @@ def plan(
     """Plan the rounds of loops and of training."""
     options = settings.fusion
     refuse_recorded(settings, "a posterior is trained in closed loops")
-    data, dataset_line = found(
-        "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
-    )
-    settings = brought_along(settings, data.settings, data.path) if data else settings
+    _, dataset_line, settings = planned_data(dataset, settings)
     find = functools.partial(open_hierarchy, checkpoint, settings, Screen(quiet=True))
     model, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     loops = 2 * options.rounds * options.devices * options.loop_steps

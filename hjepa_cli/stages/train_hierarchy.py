@@ -56,7 +56,6 @@ from hjepa_cli.stages.inputs import (
     check_same_plant,
     count_frames,
     embed,
-    open_dataset,
     sizes_of,
 )
 from hjepa_cli.stages.plan import Plan, found
@@ -66,6 +65,7 @@ from hjepa_cli.stages.training import (
     TrainingRun,
     open_training_data,
     plan_training,
+    planned_data,
     run_training,
 )
 from hjepa_cli.storage.checkpoints import Checkpoint, load_checkpoint
@@ -133,10 +133,7 @@ def plan_on(
     out: Path | None = None,
 ) -> Plan:
     """Plan for the encoder that is found, or for one that is not trained yet."""
-    data, dataset_line = found(
-        "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
-    )
-    settings = brought_along(settings, data.settings, data.path) if data else settings
+    data, dataset_line, settings = planned_data(dataset, settings)
     source, encoder_line = find(settings)
     architecture = describe_architecture(settings)
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))

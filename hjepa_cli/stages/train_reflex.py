@@ -52,7 +52,6 @@ from hjepa_cli.stages.inputs import (
     check_same_plant,
     count_frames,
     embed,
-    open_dataset,
     refuse_recorded,
 )
 from hjepa_cli.stages.model_set import default_model
@@ -63,6 +62,7 @@ from hjepa_cli.stages.training import (
     TrainingRun,
     open_training_data,
     plan_training,
+    planned_data,
     run_training,
 )
 from hjepa_cli.storage.checkpoints import Checkpoint, load_checkpoint
@@ -106,12 +106,9 @@ def plan(
     out: Path | None = None,
 ) -> Plan:
     """Plan the networks' loops and the searches on the embeddings of all views of the dataset."""
-    options, protocol = settings.reflex, settings.protocol
-    data, dataset_line = found(
-        "dataset", lambda: open_dataset(dataset, settings), dataset, "hjepa collect"
-    )
     refuse_recorded(settings, "reflexes are trained on what the teacher does elsewhere")
-    settings = brought_along(settings, data.settings, data.path) if data else settings
+    options, protocol = settings.reflex, settings.protocol
+    data, dataset_line, settings = planned_data(dataset, settings)
     find = functools.partial(open_model, checkpoint, settings, Screen(quiet=True))
     _, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))

@@ -33,7 +33,7 @@ from hjepa_cli.errors import DataError, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import results
 from hjepa_cli.stages.inputs import brought_along, count_frames, open_dataset, render
-from hjepa_cli.stages.plan import Plan, run_directory, seconds_of
+from hjepa_cli.stages.plan import Plan, found, run_directory, seconds_of
 from hjepa_cli.storage.checkpoints import MODEL_FILE, Checkpoint
 from hjepa_cli.storage.files import canonical_json
 from hjepa_cli.storage.runs import Run, describe_input
@@ -141,6 +141,14 @@ def open_training_data(path: Path | None, settings: Settings, *, h: int = 0) -> 
         if split.states.size and (split.states == split.states[0, 0]).all():
             raise _still(dataset, name, "states")
     return dataset, recorded
+
+
+def planned_data(path: Path | None, settings: Settings) -> tuple[Dataset | None, str, Settings]:
+    """Return a plan's dataset, if it is there yet, the line about it, and settings with its own."""
+    data, line = found("dataset", lambda: open_dataset(path, settings), path, "hjepa collect")
+    if data:
+        settings = brought_along(settings, data.settings, data.path)
+    return data, line, settings
 
 
 def _still(dataset: Dataset, split: str, what: str) -> DataError:
