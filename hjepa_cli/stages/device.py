@@ -18,7 +18,7 @@ from hjepa_cli.stages.plan import Plan
 from hjepa_cli.stages.serve import key_for
 from hjepa_cli.wire.actuator import Actuator, open_actuator
 from hjepa_cli.wire.bundle import Bundle, exported_by, open_bundle
-from hjepa_cli.wire.camera import Camera, Watched, open_camera, parse_crop
+from hjepa_cli.wire.camera import Watched, open_camera, parse_crop
 from hjepa_cli.wire.device import Device, EverySteps, OnInnovation
 from hjepa_cli.wire.drive import Drive
 from hjepa_cli.wire.runtime import Runtime
@@ -71,22 +71,14 @@ def run(
     runtime = Runtime(bundle, backend, precision)
     _, where = resolve(address, "--server")
     with contextlib.ExitStack() as things:
-        plants: list[SimulatedPlant] = []
-
-        def simulated() -> Camera:
-            moved = actual_plant(settings.plant, settings.conditions)
-            seen = actual_camera(seen_as_trained(settings, bundle.manifest["camera"]))
-            plants.append(
-                SimulatedPlant(moved, seen, settings.protocol, settings.seed, FIRST_DEVICE)
-            )
-            return plants[0]
-
-        opened_camera = open_camera(camera, parse_crop(crop), simulated)
-        watched = things.enter_context(contextlib.closing(Watched(opened_camera, *bundle.look)))
-        hands = actuator or ("sim" if plants else "none")
-        if hands == "sim" and not plants:
+        part = parse_crop(crop)
+        plant = simulated(settings, bundle) if camera == "sim" else None
+        watched = Watched(plant or open_camera(camera, part), *bundle.look)
+        things.enter_context(contextlib.closing(watched))
+        hands = actuator or ("sim" if plant else "none")
+        if hands == "sim" and not plant:
             raise UsageError("--actuator sim needs --camera sim: the plant that is seen is pushed")
-        acts: Actuator = plants[0] if hands == "sim" else open_actuator(hands, bundle.axes)
+        acts: Actuator = plant if hands == "sim" else open_actuator(hands, bundle.axes)
         things.enter_context(contextlib.closing(acts))
         opened = open_socket((_own_host(where), 0), "--server")
         things.enter_context(contextlib.closing(opened))
@@ -123,7 +115,7 @@ def run(
         "forces": device.counts,
         "late_steps": drive.late_steps,
         "ignored": device.ignored,
-        "score": plants[0].score if plants else None,
+        "score": plant.score if plant else None,
     }
 
 
@@ -143,6 +135,13 @@ def plan(
     until = "until interrupted" if steps is None else f"for {steps} steps"
     work = [f"send what camera {camera} sees to {server} and play its forces {until}"]
     return Plan("device", [f"exported model {model}"], work, [], 0, (steps or 0) * bundle.step_s)
+
+
+def simulated(settings: Settings, bundle: Bundle) -> SimulatedPlant:
+    """Return the settings' plant, seen by the model's camera."""
+    moved = actual_plant(settings.plant, settings.conditions)
+    seen = actual_camera(seen_as_trained(settings, bundle.manifest["camera"]))
+    return SimulatedPlant(moved, seen, settings.protocol, settings.seed, FIRST_DEVICE)
 
 
 def check_plant(bundle: Bundle, settings: Settings) -> None:

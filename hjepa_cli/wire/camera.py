@@ -6,7 +6,7 @@ that hangs.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
@@ -186,15 +186,13 @@ def parse_crop(text: str | None) -> Crop | None:
     return x, y, width, height
 
 
-def open_camera(name: str, crop: Crop | None, simulated: Callable[[], Camera]) -> Camera:
-    """Return the camera called so: ``sim``, a number, a directory of pictures, or a video file.
+def open_camera(name: str, crop: Crop | None) -> Camera:
+    """Return the camera called so: a number, a directory of pictures, or a video file.
 
     Raises:
         UsageError: none of these.
         MissingInputError, Unavailable: it is not there.
     """
-    if name == "sim":
-        return simulated()
     if name.isascii() and name.isdigit():
         return OpenCv(int(name), crop)
     path = Path(name)

@@ -88,18 +88,18 @@ def test_a_directory_of_pictures_is_replayed_in_order(tmp_path):
     image = pytest.importorskip("PIL.Image")
     for value in (3, 1, 2):
         image.fromarray(picture(value)).save(tmp_path / f"{value}.png")
-    replay = open_camera(str(tmp_path), None, lambda: None)
+    replay = open_camera(str(tmp_path), None)
     assert [int(replay.read()[0, 0, 0]) for _ in range(3)] == [1, 2, 3]
     assert replay.read() is None
     (tmp_path / "0.png").write_bytes(b"no picture")
     with pytest.raises(DataError, match=r"0\.png"):
-        open_camera(str(tmp_path), None, lambda: None).read()
+        open_camera(str(tmp_path), None).read()
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(MissingInputError, match="no pictures"):
-        open_camera(str(empty), None, lambda: None)
+        open_camera(str(empty), None)
     with pytest.raises(UsageError, match="--camera nonsense"):
-        open_camera("nonsense", None, lambda: None)
+        open_camera("nonsense", None)
 
 
 @pytest.fixture
