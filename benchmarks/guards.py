@@ -468,7 +468,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         ("core/networks/health.py", "    varies = (truth != truth[0]).any(0)", "    varies = torch.ones(truth.shape[1])"),
     ),
     "test_strange_clusters.py::test_a_listener_that_is_no_scheduler_is_soon_refused": (
-        (EXECUTORS, "                check_answer(target[\"address\"])", "                pass"),
+        (EXECUTORS, "                check_answer(address)", "                pass"),
     ),
     "test_strange_clusters.py::test_a_file_that_no_scheduler_wrote_is_refused": (
         (EXECUTORS, "    if not Path(where).exists():\n        if", "    return where\n    if True:\n        if"),

@@ -230,24 +230,24 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
     import distributed
 
     dask: Any = distributed  # it has no types
+    address: Any  # or the local cluster itself
     for name in ("distributed", "distributed.client"):  # a lost worker is no news here
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with spawning():
         if where == LOCAL:
             with signals_blocked(), semaphores():
-                local = dask.LocalCluster(
+                address = dask.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
                     dashboard_address="127.0.0.1:0",  # None is port 8787, one per machine
                     silence_logs=logging.CRITICAL,
                 )
-            target: dict[str, Any] = {"address": local}
         else:
-            target = {"address": scheduler_address(where)}
+            address = scheduler_address(where)
         try:
             if where != LOCAL:
-                check_answer(target["address"])
-            client = dask.Client(**target, timeout=CONNECT_S, set_as_default=False)
+                check_answer(address)
+            client = dask.Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError, AssertionError) as error:
             raise UsageError(
                 f"--cluster {where}: no Dask scheduler answers ({error or 'timeout'})",
@@ -271,7 +271,7 @@ def open_cluster(where: str, workers: int) -> Iterator[tuple[Executor, int]]:
             client.close()
             if where == LOCAL:
                 with suppress(TimeoutError):  # the work is done; they end with us
-                    target["address"].close()
+                    address.close()
 
 
 def scheduler_address(where: str) -> str:
