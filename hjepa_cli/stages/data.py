@@ -278,10 +278,18 @@ def chosen_format(out: Path | None, kind: str | None) -> str:
 def held_bytes(data: Dataset, split: str) -> int:
     """Return what an export holds at once: the split twice while it is read, then its columns."""
     described = data.splits.get(split, {"trajectories": 0, "steps": 0})
-    system = data.kind
-    row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
     stored_bytes = math.prod(data.frame_shape) * (data.frames == "stored")
-    return described["trajectories"] * (described["steps"] + 1) * (4 * row_bytes + 2 * stored_bytes)
+    return (
+        described["trajectories"]
+        * (described["steps"] + 1)
+        * (4 * row_bytes(data) + 2 * stored_bytes)
+    )
+
+
+def row_bytes(data: Dataset) -> int:
+    """Return what a row of an export has without its picture: states, and two times its forces."""
+    system = data.kind
+    return 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
 
 
 def plan_export(
@@ -294,8 +302,6 @@ def plan_export(
         data.split(split)  # says so
     described = data.splits[split]
     rows = described["trajectories"] * (described["steps"] + 1)
-    system = data.kind
-    row_bytes = 4 * (len(system.state_names) + 2 * math.prod(system.action_shape))
     frames = rows if pixels else 0
     work = [f"gather {rows} rows of split {split}"]
     if frames and data.frames == "rendered":
@@ -306,7 +312,7 @@ def plan_export(
         reads=[f"dataset {data.path}"],
         work=work,
         writes=[f"{kind} file {target}"],
-        writes_bytes=rows * row_bytes + frames * COMPRESSED_FRAME_BYTES,
+        writes_bytes=rows * row_bytes(data) + frames * COMPRESSED_FRAME_BYTES,
         seconds=1 + seconds_of({"rendered frames": frames, "exported frames": frames}),
         memory_bytes=held_bytes(data, split),
     )

@@ -254,7 +254,7 @@ def recorded_task(directory: Path) -> Task:
 
 def begun_with(task: Task) -> dict[str, Any]:
     """Return the first line of the log of an import."""
-    return {TASK: to_plain(task), "sources": stamps(task)}
+    return {TASK: msgspec.json.decode(msgspec.json.encode(task)), "sources": stamps(task)}
 
 
 def stamps(task: Task) -> dict[str, Any]:
@@ -287,12 +287,6 @@ def check_same(directory: Path, begun: Mapping[str, Any]) -> None:
             f"the source has changed since {directory} was begun",
             hint=f"delete {directory} to import again, or choose another --out DIR",
         )
-
-
-def to_plain(task: Task) -> dict[str, Any]:
-    """Return a task as JSON has it."""
-    plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(task))
-    return plain
 
 
 def plan_task(task: Task, out: Path | None) -> Plan:

@@ -149,15 +149,12 @@ class _Share:
         self.found |= {name: (kept[name], own) for name in methods if name in kept}
         self.missing = [name for name in methods if name not in self.found]
         # Beside the model too where that is a run of ours; the zoo is none.
-        self._own, self._files = (
-            own,
-            [own]
-            + [
-                path
-                for path in models.beside
-                if (path.parent / runs.CONFIG).is_file() and os.access(path.parent, os.W_OK)
-            ],
-        )
+        ours = [
+            path
+            for path in models.beside
+            if (path.parent / runs.CONFIG).is_file() and os.access(path.parent, os.W_OK)
+        ]
+        self._own, self._files = own, [own, *ours]
 
     def keep(self, method: str, entry: Entry) -> None:
         """Write what was measured, at once."""
