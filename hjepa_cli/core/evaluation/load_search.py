@@ -75,6 +75,35 @@ def find_load(
             blocks, so that several seeds say more.
         start: a load near the one to find, like that of another seed: fewer to simulate.
     """
+    points = _bisected(simulate, acceptable_score, bracket, start)
+    for remaining in range(MAX_WIDENINGS, -1, -1):
+        ascending = [points[load] for load in sorted(points)]
+        crossing, least, most = _crossings(ascending, acceptable_score, replicates, seed)
+        outside = [min(round(min(points) / WIDER), min(points) - 1)] * math.isinf(least)
+        outside += [max(round(max(points) * WIDER), max(points) + 1)] * math.isinf(most)
+        outside = [load for load in outside if math.isfinite(crossing) and 1 <= load <= MAX_LOAD]
+        if not outside or not remaining:
+            break
+        points |= {load: simulate(load) for load in outside}
+    inside = [point for point in ascending if point.load <= crossing] or ascending[:1]
+    ends = {-math.inf: 0.0, math.inf: float(ascending[-1].load)}  # numbers that can be multiplied
+    return SupportedLoad(
+        load=ends.get(crossing, crossing),
+        interval=(ends.get(least, least), ends.get(most, most)),
+        at_least=crossing == math.inf,
+        packets_per_slot=inside[-1].packets_per_slot,
+        reports_per_slot=inside[-1].reports_per_slot,
+        points=tuple((point.load, point.score) for point in ascending),
+    )
+
+
+def _bisected(
+    simulate: Callable[[int], LoadPoint],
+    acceptable_score: float,
+    bracket: float,
+    start: float | None,
+) -> dict[int, LoadPoint]:
+    """Simulate loads on both sides of the one to find, nearer and nearer; return them by load."""
     points: dict[int, LoadPoint] = {}
     low, high, step = 1, MAX_LOAD, 1 + 4 * bracket
     for _ in range(MAX_BISECTIONS):
@@ -97,26 +126,7 @@ def find_load(
         both = low in points and high in points
         if both and (high - low <= 1 or high / low <= 1 + bracket):
             break
-
-    for remaining in range(MAX_WIDENINGS, -1, -1):
-        ascending = [points[load] for load in sorted(points)]
-        crossing, least, most = _crossings(ascending, acceptable_score, replicates, seed)
-        outside = [min(round(min(points) / WIDER), min(points) - 1)] * math.isinf(least)
-        outside += [max(round(max(points) * WIDER), max(points) + 1)] * math.isinf(most)
-        outside = [load for load in outside if math.isfinite(crossing) and 1 <= load <= MAX_LOAD]
-        if not outside or not remaining:
-            break
-        points |= {load: simulate(load) for load in outside}
-    inside = [point for point in ascending if point.load <= crossing] or ascending[:1]
-    ends = {-math.inf: 0.0, math.inf: float(ascending[-1].load)}  # numbers that can be multiplied
-    return SupportedLoad(
-        load=ends.get(crossing, crossing),
-        interval=(ends.get(least, least), ends.get(most, most)),
-        at_least=crossing == math.inf,
-        packets_per_slot=inside[-1].packets_per_slot,
-        reports_per_slot=inside[-1].reports_per_slot,
-        points=tuple((point.load, point.score) for point in ascending),
-    )
+    return points
 
 
 def combine(found: Sequence[SupportedLoad]) -> SupportedLoad:
