@@ -329,16 +329,8 @@ COMMANDS = (
         Imported("hjepa_cli.stages.import_data:run"),
         (
             *("source", "test", "clean", "kind:import", "size", "grey", "limit"),
-            *(
-                "fps:import",
-                "action_offset",
-                "steps:import",
-                "held_out",
-                "mirror_signs",
-                "actions",
-                "states",
-            ),
-            *("expert", "camera", "skip_bad", "out"),
+            *("fps:import", "action_offset", "steps:import", "held_out", "mirror_signs"),
+            *("actions", "states", "expert", "camera", "skip_bad", "out"),
         ),
         plan=Imported("hjepa_cli.stages.import_data:plan"),
         product="dataset",
