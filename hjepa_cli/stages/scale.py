@@ -79,7 +79,8 @@ def run(
         DataError: a damaged checkpoint, or one of another plant.
         NumericalError: ``verify`` does not confirm what was found.
     """
-    radio, kind = settings.radio, plant_of(settings)
+    radio = settings.radio
+    plant_of(settings)  # which refuses settings that do not fit their plant
     grid_db, asked = parse_snr(radio.snr_db), Looks.of(title, labels, log)
     check_cell(radio, {"remeasure": remeasure}, settings.nr)
     inputs = (checkpoint, dataset, further, tolerance_steps)
@@ -92,23 +93,7 @@ def run(
         if result is not None:
             screen.say(f"{record.directory} is finished; this is its result")
         else:
-            at_db = PAPER_SNR_DB if PAPER_SNR_DB in grid_db else max(grid_db)
-            result = {
-                "plant": settings.plant,
-                "seed": settings.seed,
-                "acceptable_score": settings.protocol.acceptable_score,
-                "link": link.facts(settings.protocol, len(kind.force_signs)),
-                "law": radio.law,
-                "phy": radio.phy,
-                **({} if radio.phy == "shannon" else {"nr": settings.as_dict()["nr"]}),
-                "bandwidth_hz": radio.bandwidth_hz,
-                "slot_s": kind.step_s,
-                "limit_bits_per_s": kind.data_rate_limit_bits_per_s,
-                "paper_gain_percent": PAPER_GAIN_PERCENT,
-                "skipped": count.models.skipped(settings.methods),
-                **count.counted(record, grid_db, remeasure=remeasure, verify=verify),
-            }
-            result["gains"] = count.gains(result["rows"], at_db)
+            result = counted(settings, count, record, grid_db, remeasure=remeasure, verify=verify)
             result["csv"] = write_csv(record.path("devices.csv"), result["rows"], count.columns)
             result["figures"] = draw(result, asked, record.directory, screen)
             result = record.finish(result)
@@ -120,6 +105,36 @@ def run(
             screen.say(f"written: {', '.join(map(str, (result['csv'], *result['figures'])))}")
             enforce(result)
         return result
+
+
+def counted(
+    settings: Settings,
+    count: ByFormula | BySimulation,
+    record: Run,
+    grid_db: Sequence[float],
+    *,
+    remeasure: bool,
+    verify: bool,
+) -> dict[str, Any]:
+    """Return the document of ``--json`` but for the files that are made of it."""
+    radio, kind = settings.radio, plant_of(settings)
+    at_db = PAPER_SNR_DB if PAPER_SNR_DB in grid_db else max(grid_db)
+    result = {
+        "plant": settings.plant,
+        "seed": settings.seed,
+        "acceptable_score": settings.protocol.acceptable_score,
+        "link": link.facts(settings.protocol, len(kind.force_signs)),
+        "law": radio.law,
+        "phy": radio.phy,
+        **({} if radio.phy == "shannon" else {"nr": settings.as_dict()["nr"]}),
+        "bandwidth_hz": radio.bandwidth_hz,
+        "slot_s": kind.step_s,
+        "limit_bits_per_s": kind.data_rate_limit_bits_per_s,
+        "paper_gain_percent": PAPER_GAIN_PERCENT,
+        "skipped": count.models.skipped(settings.methods),
+        **count.counted(record, grid_db, remeasure=remeasure, verify=verify),
+    }
+    return result | {"gains": count.gains(result["rows"], at_db)}
 
 
 def plan(
