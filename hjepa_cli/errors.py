@@ -1,7 +1,8 @@
 """Users can cause or meet these errors, each with the exit code that the shell sees.
 
 An :class:`HjepaError` is printed as one line (what was wrong, where, the valid choices) plus an
-optional hint (the command to run next); it never shows a traceback. Codes follow sysexits.h.
+optional hint (the command to run next); it never shows a traceback. Codes follow sysexits.h. Below
+them is what messages are made of.
 """
 
 import difflib
@@ -59,52 +60,6 @@ class MissingInputError(HjepaError):
     exit_code = 66
 
 
-def shell(words: Iterable[object]) -> str:
-    """Return a command as a shell takes it back, in one line and whatever bytes are in a path."""
-    return " ".join(map(_quoted, map(str, words)))
-
-
-def _quoted(word: str) -> str:
-    if word.isprintable():
-        return shlex.quote(word)
-    plain = (
-        chr(b) if 32 <= b < 127 and b not in b"'\\" else f"\\x{b:02x}" for b in os.fsencode(word)
-    )
-    return f"$'{''.join(plain)}'"
-
-
-def meant(name: object, names: Iterable[str], prefix: str = "") -> str:
-    """Ask whether the nearest of some names was meant, for a message; ``""`` where none is near.
-
-    All of them are said with the ``prefix``.
-    """
-    near = difflib.get_close_matches(str(name), names, n=1)
-    return f"did you mean '{prefix}{near[0]}'? " if near else ""
-
-
-def choices(name: object, names: Iterable[str], verb: str = "choose from") -> str:
-    """Say what a name may be, for a message: the nearest first, then all."""
-    return f"{meant(name, names := list(names))}{verb} {', '.join(names)}"
-
-
-def require(module: str, what: str, extra: str, instead: str = "") -> None:
-    """Raise MissingInputError for what needs a package of an extra that is not installed."""
-    if find_spec(module) is None:
-        raise MissingInputError(
-            f"{what}, which is not installed", hint=f'pip install "hjepa[{extra}]"{instead}'
-        )
-
-
-def together(errors: Sequence[HjepaError]) -> HjepaError:
-    """Return the first of some errors about files; where there are more, it names them all."""
-    first = errors[0]
-    if len(errors) > 1:
-        named = [one.message for one in errors[:MOST_NAMED]]
-        named += [f"{len(errors) - MOST_NAMED} more"] * (len(errors) > MOST_NAMED)
-        first.message = f"{len(errors)} files are damaged or unreadable: {'; '.join(named)}"
-    return first
-
-
 class Unavailable(HjepaError):
     """A network peer does not answer, or an address or a port cannot be had."""
 
@@ -155,3 +110,49 @@ class Interrupted(HjepaError):
     def __init__(self, message: str, *, hint: str | None = None, code: int = 130) -> None:
         super().__init__(message, hint=hint)
         self.exit_code = code
+
+
+def shell(words: Iterable[object]) -> str:
+    """Return a command as a shell takes it back, in one line and whatever bytes are in a path."""
+    return " ".join(map(_quoted, map(str, words)))
+
+
+def _quoted(word: str) -> str:
+    if word.isprintable():
+        return shlex.quote(word)
+    plain = (
+        chr(b) if 32 <= b < 127 and b not in b"'\\" else f"\\x{b:02x}" for b in os.fsencode(word)
+    )
+    return f"$'{''.join(plain)}'"
+
+
+def meant(name: object, names: Iterable[str], prefix: str = "") -> str:
+    """Ask whether the nearest of some names was meant, for a message; ``""`` where none is near.
+
+    All of them are said with the ``prefix``.
+    """
+    near = difflib.get_close_matches(str(name), names, n=1)
+    return f"did you mean '{prefix}{near[0]}'? " if near else ""
+
+
+def choices(name: object, names: Iterable[str], verb: str = "choose from") -> str:
+    """Say what a name may be, for a message: the nearest first, then all."""
+    return f"{meant(name, names := list(names))}{verb} {', '.join(names)}"
+
+
+def require(module: str, what: str, extra: str, instead: str = "") -> None:
+    """Raise MissingInputError for what needs a package of an extra that is not installed."""
+    if find_spec(module) is None:
+        raise MissingInputError(
+            f"{what}, which is not installed", hint=f'pip install "hjepa[{extra}]"{instead}'
+        )
+
+
+def together(errors: Sequence[HjepaError]) -> HjepaError:
+    """Return the first of some errors about files; where there are more, it names them all."""
+    first = errors[0]
+    if len(errors) > 1:
+        named = [one.message for one in errors[:MOST_NAMED]]
+        named += [f"{len(errors) - MOST_NAMED} more"] * (len(errors) > MOST_NAMED)
+        first.message = f"{len(errors)} files are damaged or unreadable: {'; '.join(named)}"
+    return first
