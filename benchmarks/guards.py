@@ -498,6 +498,12 @@ GUARDS: dict[str, tuple[Change, ...]] = {
     "test_outside.py::test_the_radio_refuses_what_is_no_array_or_does_not_go_together": (
         (CHANNEL, "        except (TypeError, ValueError) as error:\n            raise ArrayError", "        except ZeroDivisionError as error:\n            raise ArrayError"),
     ),
+    "test_answers.py::test_a_plant_that_answers_wrong_is_named": (
+        ("core/plants/system.py", "            look_at(cls)", "            pass"),
+    ),
+    "test_answers.py::test_what_a_plant_does_to_its_arrays_is_its_own": (
+        ("core/plants/answers.py", "return given.copy() if isinstance(given, np.ndarray) else given", "return given"),
+    ),
     "test_gym_copies.py::test_an_environment_is_made_again_from_its_spec": (
         ("gym.py", "        gymnasium.utils.RecordConstructorArgs.__init__(self, **kept)", "        pass"),
     ),

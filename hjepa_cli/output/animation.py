@@ -19,8 +19,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from hjepa_cli.core.arrays import Floats
-from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.frames import HEIGHT_PX, WIDTH_PX, Camera
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import StorageError, UsageError, require
 from hjepa_cli.output.film import Film, Link
 from hjepa_cli.output.pictures import FAINT, INK, PAPER, font

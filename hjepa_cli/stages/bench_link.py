@@ -33,9 +33,9 @@ from hjepa_cli.core.control.drivers import planner_of
 from hjepa_cli.core.control.loop import Draws, LinkDraws, delivery_schedule, gap_schedule, simulate
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
-from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_back, frames_of
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, Camera, frames_back, frames_of
 from hjepa_cli.core.plants.named import plant_of, seen_as_trained
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.statistics import bootstrap_weights, mean_interval
 from hjepa_cli.errors import DataError, NumericalError, Unavailable, UsageError, shell
 from hjepa_cli.output.screen import Screen

@@ -18,10 +18,10 @@ from hjepa_cli.core.datasets.dataset import (
     load_dataset,
 )
 from hjepa_cli.core.plants.control_law import control_law, control_of
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import Camera, frames_of
 from hjepa_cli.core.plants.named import camera_in, camera_of, sensor_in
 from hjepa_cli.core.plants.recorded import Recorded
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import HjepaError, MissingInputError, UsageError, require, together
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan, seconds_of, size

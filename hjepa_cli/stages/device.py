@@ -10,8 +10,8 @@ from typing import Any
 
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.plants.conditions import actual_camera, actual_plant
+from hjepa_cli.core.plants.frames import same_camera
 from hjepa_cli.core.plants.named import camera_of, plant_of, seen_as_trained, sensor_in
-from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, Unavailable, UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages.plan import Plan

@@ -28,9 +28,8 @@ from hjepa_cli.core.datasets.trajectories import split_sizes
 from hjepa_cli.core.networks.model import encode_frames
 from hjepa_cli.core.plants.conditions import vary
 from hjepa_cli.core.plants.control_law import control_of
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import frames_of, same_camera
 from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, plant_of, sensor_in
-from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.core.training.batches import shift_sideways
 from hjepa_cli.core.training.rendered import RenderedSplit
 from hjepa_cli.errors import DataError, MissingInputError, UsageError, shell

@@ -16,8 +16,8 @@ import numpy as np
 
 from hjepa_cli.core.arrays import Bools, Floats, Pixels
 from hjepa_cli.core.control.loop import Draws, LinkDraws, ScoredPlants
-from hjepa_cli.core.plants.frames import frames_back, frames_of
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.frames import Camera, frames_back, frames_of
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import NumericalError
 from hjepa_cli.wire import protocol
 from hjepa_cli.wire.bundle import Bundle

@@ -7,7 +7,8 @@ import numpy as np
 from hjepa_cli.config.schema import ProtocolSettings
 from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.control.loop import ScoredPlants, device_draws, noise_per_step
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.frames import Camera
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.wire.runtime import Singles
 
 

@@ -17,8 +17,9 @@ from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
 from hjepa_cli.core.plants.conditions import Disturbed, actual_camera, actual_plant, vary
 from hjepa_cli.core.plants.control_law import control_of
+from hjepa_cli.core.plants.frames import Camera
 from hjepa_cli.core.plants.named import plant
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import collect

@@ -12,10 +12,9 @@ from hjepa_cli.config.schema import CameraSettings, SensorSettings, Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.plants import corruptions
 from hjepa_cli.core.plants.conditions import actual_camera
-from hjepa_cli.core.plants.frames import frames_of
+from hjepa_cli.core.plants.frames import frames_of, same_camera
 from hjepa_cli.core.plants.named import camera_of, plant, seen_as_trained, sensor_in
 from hjepa_cli.core.plants.sensor import OPEN, Sensed, on_the_ground, rates_of
-from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import UsageError
 
 ROWS, COLUMNS = np.mgrid[:64, :128]

@@ -152,6 +152,8 @@
 | 44 | embeddings of other types and shapes | test_outside.py::test_other_embeddings_are_refused |
 | 44 | states of other types and shapes | test_outside.py::test_other_states_are_refused_by_teachers_and_cart_poles |
 | 44 | links of other types and shapes | test_outside.py::test_the_radio_refuses_what_is_no_array_or_does_not_go_together |
+| 44 | a plant that answers something else | test_answers.py::test_a_plant_that_answers_wrong_is_named |
+| 44 | a plant that changes what it is given | test_answers.py::test_what_a_plant_does_to_its_arrays_is_its_own |
 | 45 | an environment that cannot be made again | test_gym_copies.py::test_an_environment_is_made_again_from_its_spec |
 | 45 | an environment that cannot be copied | test_gym_copies.py::test_a_copy_goes_on_where_the_original_is |
 | 46 | a model of preset smoke as the newest | test_smoke.py::test_a_smoke_model_is_nobody_s_default |

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats, check_answer, finite
 from hjepa_cli.core.control.codecs.codec import Coder
-from hjepa_cli.core.control.guarded import guarded
 from hjepa_cli.core.control.loop import Controller
+from hjepa_cli.core.plants.guarded import guarded
 from hjepa_cli.errors import ArrayError
 from hjepa_cli.plugins import CODECS, METHODS
 

@@ -22,7 +22,6 @@ from hjepa_cli.core.control.controllers import LastForce
 from hjepa_cli.core.control.disagreement import TwoLevels
 from hjepa_cli.core.control.embedded_split import sampled_embeddings
 from hjepa_cli.core.control.familiarity import PacketCheck, fit_familiarity
-from hjepa_cli.core.control.guarded import guarded
 from hjepa_cli.core.control.link import confirmation_bits
 from hjepa_cli.core.control.loop import Controller, Draws, Sensor
 from hjepa_cli.core.control.sensors import embedding_sensor
@@ -30,6 +29,7 @@ from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera
 from hjepa_cli.core.plants.control_law import control_of
+from hjepa_cli.core.plants.guarded import guarded
 from hjepa_cli.core.plants.named import camera_in, plant, seen_as_trained
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import DataError, UsageError, choices

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Floats, Pixels
-from hjepa_cli.core.plants.frames import frames_back, frames_of
-from hjepa_cli.core.plants.system import Camera
+from hjepa_cli.core.plants.frames import Camera, frames_back, frames_of
 
 if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Gaze, Model

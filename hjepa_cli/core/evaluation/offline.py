@@ -21,8 +21,7 @@ from hjepa_cli.core.evaluation.bench import control_entry
 from hjepa_cli.core.evaluation.control_errors import control_errors
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
-from hjepa_cli.core.plants.frames import frames_seen
-from hjepa_cli.core.plants.system import Camera
+from hjepa_cli.core.plants.frames import Camera, frames_seen
 
 WITHIN = (0.02, 0.05, 0.1)  # of the force range
 

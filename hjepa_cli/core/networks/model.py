@@ -23,9 +23,8 @@ from hjepa_cli.core.networks.outside import embeddings_from, frames_from
 from hjepa_cli.core.networks.photometry import FITS
 from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.networks.reflex import Decay, Reflex, read_decays
-from hjepa_cli.core.plants.frames import LONGEST
+from hjepa_cli.core.plants.frames import LONGEST, same_camera
 from hjepa_cli.core.plants.named import camera_in, camera_of, plant_in, sensor_in
-from hjepa_cli.core.plants.system import same_camera
 from hjepa_cli.errors import DataError, UsageError, shell
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.storage.checkpoints import Checkpoint, check_tensors, load_checkpoint

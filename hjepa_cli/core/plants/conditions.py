@@ -17,11 +17,11 @@ from hjepa_cli.config.schema import ConditionSettings, EncoderSettings, Settings
 from hjepa_cli.core.arrays import Floats, Pixels
 from hjepa_cli.core.plants import corruptions, stress
 from hjepa_cli.core.plants.corruptions import as_bytes
-from hjepa_cli.core.plants.frames import FRAME_SHAPE
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, Camera
 from hjepa_cli.core.plants.named import camera_of, plant
 from hjepa_cli.core.plants.recorded import Recorded
 from hjepa_cli.core.plants.stress import CONDITIONS, Condition, Parts
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.core.plants.worn import Worn
 from hjepa_cli.errors import UsageError
 

@@ -1,17 +1,44 @@
 """Camera frames have a usual size, and a device remembers some of them for its network."""
 
+import json
 import math
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hjepa_cli.config.checks import FARTHEST_BACK
-from hjepa_cli.core.arrays import Integers, Pixels, finite
-from hjepa_cli.core.plants.system import Camera
+from hjepa_cli.core.arrays import Floats, Integers, Pixels, finite
 
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 FRAME_SHAPE = (HEIGHT_PX, WIDTH_PX, CHANNELS)
 LONGEST = FARTHEST_BACK + 1  # frames that a device keeps, from which its network sees κ
+
+
+class Camera(Protocol):
+    """A camera sees a system from the side."""
+
+    def render(self, states: ArrayLike) -> Pixels:
+        """Return RGB frames ``[n, 64, 128, 3]`` of states ``[n, S]``.
+
+        Raises:
+            NumericalError: a state is not finite.
+        """
+
+    def manifest(self) -> dict[str, Any]:
+        """Return all that fixes a picture besides the state, plain; ``version`` among it."""
+
+    def sketch_px(self, state: ArrayLike) -> list[Floats]:
+        """Return a state ``[S]`` as lines through points ``[k, 2]`` (column, row) of its picture.
+
+        Drawn over a picture to show what a controller believes; the first line is the axis whose
+        lean matters.
+        """
+
+
+def same_camera(recorded: object, camera: Camera) -> bool:
+    """Say whether a file's pictures are of a camera, by the manifest that it holds."""
+    return bool(recorded == json.loads(json.dumps(camera.manifest())))
 
 
 def frame_bits(frame_shape: tuple[int, int, int]) -> int:

@@ -19,10 +19,10 @@ from hjepa_cli.core.plants.cartpole import camera
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
 from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 from hjepa_cli.core.plants.frames import FRAME_SHAPE
+from hjepa_cli.core.plants.frames import Camera as SystemCamera
 from hjepa_cli.core.plants.recorded import Recorded, RecordedCamera
 from hjepa_cli.core.plants.resizing import Resized
 from hjepa_cli.core.plants.sensor import Sensed
-from hjepa_cli.core.plants.system import Camera as SystemCamera
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.errors import ArrayError, UsageError
 

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from hjepa_cli.config.schema import RECORDED, CameraSettings, RecordedSettings
 from hjepa_cli.core.arrays import Bools, Floats, Pixels
-from hjepa_cli.core.plants.system import Camera, Simulation, System, Teacher
+from hjepa_cli.core.plants.frames import Camera
+from hjepa_cli.core.plants.system import Simulation, System, Teacher
 from hjepa_cli.errors import UsageError
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hjepa_cli.core.arrays import Floats, Pixels
-from hjepa_cli.core.plants.system import Camera
+from hjepa_cli.core.plants.frames import Camera
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 

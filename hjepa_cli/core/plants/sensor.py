@@ -21,8 +21,8 @@ from hjepa_cli.config.schema import SensorSettings
 from hjepa_cli.core.arrays import Floats, Pixels, finite
 from hjepa_cli.core.plants import corruptions
 from hjepa_cli.core.plants.corruptions import Pictures, as_bytes
-from hjepa_cli.core.plants.frames import FRAME_SHAPE
-from hjepa_cli.core.plants.system import Camera, System
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, Camera
+from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import UsageError
 
 VERSION = 1  # raise it whenever any picture changes

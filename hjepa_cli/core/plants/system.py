@@ -5,7 +5,6 @@ force drives a device and ``(m,)`` where m forces do. So ``[n, *A]`` is ``[n]`` 
 """
 
 import abc
-import json
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar, Protocol
@@ -13,7 +12,9 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hjepa_cli.core.arrays import Bools, Floats, Pixels, described, finite
+from hjepa_cli.core.arrays import Bools, Floats, described, finite
+from hjepa_cli.core.plants.answers import look_at
+from hjepa_cli.core.plants.frames import Camera
 from hjepa_cli.core.plants.linear import linearise, unstable_rate_rad_s
 from hjepa_cli.errors import ArrayError, UsageError
 from hjepa_cli.plugins import check_members
@@ -123,32 +124,6 @@ def check_masses(devices: int, mass_scale: ArrayLike | None) -> Floats:
     return scale
 
 
-class Camera(Protocol):
-    """A camera sees a system from the side."""
-
-    def render(self, states: ArrayLike) -> Pixels:
-        """Return RGB frames ``[n, 64, 128, 3]`` of states ``[n, S]``.
-
-        Raises:
-            NumericalError: a state is not finite.
-        """
-
-    def manifest(self) -> dict[str, Any]:
-        """Return all that fixes a picture besides the state, plain; ``version`` among it."""
-
-    def sketch_px(self, state: ArrayLike) -> list[Floats]:
-        """Return a state ``[S]`` as lines through points ``[k, 2]`` (column, row) of its picture.
-
-        Drawn over a picture to show what a controller believes; the first line is the axis whose
-        lean matters.
-        """
-
-
-def same_camera(recorded: object, camera: Camera) -> bool:
-    """Say whether a file's pictures are of a camera, by the manifest that it holds."""
-    return bool(recorded == json.loads(json.dumps(camera.manifest())))
-
-
 class System(abc.ABC):
     """A kind of plant has a teacher, a camera and a score; states have any leading axes.
 
@@ -170,6 +145,12 @@ class System(abc.ABC):
     state_units: ClassVar[tuple[str, ...]]
     action_shape: ClassVar[tuple[int, ...]] = ()
     mirror: ClassVar[float | tuple[float, ...]] = -1.0
+
+    def __init_subclass__(cls, **named: Any) -> None:
+        """Let what classes from outside of the package answer be looked at."""
+        super().__init_subclass__(**named)
+        if not cls.__module__.startswith("hjepa_cli."):
+            look_at(cls)
 
     @abc.abstractmethod
     def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> Simulation:

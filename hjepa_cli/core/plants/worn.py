@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from hjepa_cli.core.arrays import Bools, Floats, finite
 from hjepa_cli.core.plants.cartpole.plant import CartPolePlant
-from hjepa_cli.core.plants.system import Camera, Simulation, System, Teacher
+from hjepa_cli.core.plants.frames import Camera
+from hjepa_cli.core.plants.system import Simulation, System, Teacher
 from hjepa_cli.errors import UsageError
 
 FRICTION = ("viscous", "coulomb")

@@ -14,7 +14,7 @@ from hjepa_cli.compute.seeding import generator
 from hjepa_cli.core.arrays import Bools, Floats
 from hjepa_cli.core.control.disagreement import LevelDisagreement
 from hjepa_cli.core.control.error_growth import ErrorGrowthTable
-from hjepa_cli.core.control.guarded import guarded
+from hjepa_cli.core.plants.guarded import guarded
 from hjepa_cli.core.radio.doppler import Motion, moving_fading
 from hjepa_cli.core.radio.fading import block_fading
 from hjepa_cli.core.radio.phy.phy import Reports

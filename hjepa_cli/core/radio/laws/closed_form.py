@@ -9,7 +9,7 @@ from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any
 
-from hjepa_cli.core.control.guarded import guarded
+from hjepa_cli.core.plants.guarded import guarded
 from hjepa_cli.core.radio.cell import Cell, Link
 from hjepa_cli.core.radio.laws.law import Row, SharingLaw
 from hjepa_cli.core.radio.laws.requirement import Axis, LinkRequirement
