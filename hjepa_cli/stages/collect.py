@@ -26,6 +26,7 @@ from hjepa_cli.core.datasets.dataset import (
     load_dataset,
     open_directory,
     per_shard,
+    undone,
     write_manifest,
     write_shard,
 )
@@ -51,6 +52,7 @@ from hjepa_cli.storage.shards import (
     remove_log,
 )
 
+PLUGIN = "plugin"  # of the plant, by its digest, in the first line of the log
 OWN = ("control", "camera", "sensor")  # what a dataset brings along for all that is done with it
 FRAMES_PER_SAMPLE = 2  # the paper's pairs
 TOGETHER = 20  # trajectories rendered at a time; the sample is one such batch
@@ -79,19 +81,23 @@ def run(settings: Settings, screen: Screen, *, out: Path | None = None) -> dict[
     if conditions := altered(settings.as_dict()):  # clean rollouts are of such devices
         definition["conditions"] = conditions
     definition |= {key: value for key, value in settings.as_dict().items() if key in OWN}
+    existed = out is not None and out.exists()
     with open_directory(out, settings.plant) as directory:
         if (directory / MANIFEST).exists():
             return describe_finished(directory, screen, settings.plant, definition)
         check_same(directory, settings)
         check_room(directory, size_bytes(settings))
-        with telling_how_to_go_on(directory):
-            log = ShardLog(directory, settings.as_dict())
+        begun = (directory / LOG).exists()
+        # What a plant cannot do shows here, before anything is there that could be taken up.
+        with contextlib.nullcontext() if begun else undone(directory, BaseException, keep=existed):
             sample = generate(
                 settings, "train", range(min(TOGETHER, settings.collect.trajectories))
             )
             began = time.perf_counter()
             frames_of(camera, sample.states)  # rendered and dropped
             frames_per_s = sample.states[..., 0].size / (time.perf_counter() - began)
+        with telling_how_to_go_on(directory):
+            log = ShardLog(directory, begun_with(settings))
             data = write_manifest(
                 directory,
                 settings=definition,
@@ -191,16 +197,31 @@ def check_same(directory: Path, settings: Settings) -> None:
         )
 
 
+def begun_with(settings: Settings) -> dict[str, Any]:
+    """Return the first line of the log: the settings, and which text of a plugin is the plant."""
+    source = PLANTS.source(settings.plant)
+    return settings.as_dict() | ({PLUGIN: source.sha256} if source else {})
+
+
 def recorded_settings(directory: Path) -> Settings:
     """Return what is being collected; settings that its version had not are its preset's.
 
-    Raises DataError if the log is damaged, or of a version with other settings.
+    Raises:
+        UsageError: no plugin in force adds its plant, or its file has changed.
+        DataError: the log is damaged, or of a version with other settings.
     """
     task = read_task(directory)
+    again = f"delete {directory} to collect again, or choose another --out DIR"
     if isinstance(name := task.get("plant"), str) and name not in PLANTS:
         raise UsageError(
             f"{directory} collects of plant '{name}', which no plugin in force adds",
             hint=f"{continue_command(directory)} --plugin FILE.py",
+        )
+    begun, source = task.pop(PLUGIN, None), PLANTS.source(str(name))
+    if begun and source and begun != source.sha256:
+        raise UsageError(
+            f"{directory} was begun with plugin {source.name}, which has changed since",
+            hint=f"restore the file; or {again}",
         )
     preset = task.pop("preset", None)
     if preset is not None and not isinstance(preset, str):
@@ -210,8 +231,7 @@ def recorded_settings(directory: Path) -> Settings:
         check_settings(settings)
     except UsageError as error:
         raise DataError(
-            f"{directory / LOG} was not written by this version: {error.message}",
-            hint=f"delete {directory} to collect again, or choose another --out DIR",
+            f"{directory / LOG} was not written by this version: {error.message}", hint=again
         ) from None
     return settings
 

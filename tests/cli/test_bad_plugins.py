@@ -368,3 +368,43 @@ def test_a_collection_of_a_plant_that_is_not_there_is_named(shell):
     with shell.untouched():
         outcome = shell("resume", "c")
     assert_one_line_error(outcome, 2, "of plant 'pendulum'", "hint: hjepa resume c --plugin FILE")
+
+
+SMALL = """
+plant = "pendulum"
+[collect]
+trajectories = 2
+test_trajectories = 2
+clean_trajectories = 1
+steps = 4
+clean_steps = 4
+start = [0.3, 2.0]
+[encoder]
+gate_r2 = [0.9, 0.9]
+[protocol]
+start = [0.1, 0.3]
+noise = [0.0, 0.03]
+"""
+
+
+def test_a_collection_goes_on_with_the_plant_that_it_was_begun_with(shell):
+    """Shards of two texts of a file would be trajectories of two plants."""
+    stops = "import os\n        if devices == 1 and os.path.exists('stop'): raise KeyboardInterrupt"
+    text = PLANT.replace("return Integrated(", f"{stops}\n        return Integrated(")
+    Path("c.toml").write_text(SMALL)
+    collect = ("collect", "--plugin", "mine.py", "--config", "c.toml", "--out", "c", "--quiet")
+
+    Path("mine.py").write_text(text.replace("return draw(", "return 0.5 * draw("))
+    with shell.untouched():  # a plant that cannot be seen is found before anything is there
+        assert_one_line_error(shell(*collect), 2, "render(…) is float64")
+    Path("mine.py").write_text(text)
+    Path("stop").touch()
+    assert shell(*collect).code == 130
+    Path("stop").unlink()
+    Path("mine.py").write_text(text.replace("mass_kg: float = 0.1", "mass_kg: float = 0.9"))
+    for again in (collect, ("resume", "c", "--plugin", "mine.py")):
+        with shell.untouched():
+            outcome = shell(*again)
+        assert_one_line_error(outcome, 2, "begun with plugin mine.py, which has changed", "delete")
+    Path("mine.py").write_text(text)
+    assert shell("resume", "c", "--plugin", "mine.py").code == 0
