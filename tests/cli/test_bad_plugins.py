@@ -23,6 +23,7 @@ CODEC = block("plugins.md", "Codec(")
 METHOD = block("plugins.md", "least-squares")
 PHY = block("plugins.md", "register(Phy(")
 PLANT = block("own_plant.md", "class Pendulum")
+STEP = "step_s: float = 5e-3"
 QUICK = """
 [protocol]
 warmup_steps = 0
@@ -150,6 +151,12 @@ def test_names_that_no_list_flag_or_path_can_carry_are_refused(shell, text, name
         (SCHEDULER, "np.where(view.able, view.waited, 0.0))", "0, 'yes')", "= 'yes' is no bool"),
         (PLANT, "step_s: float = 5e-3", "step_s: float = 0.0", "step_s = 0.0; expected more"),
         (PLANT, '("rad", "rad/s")', '("rad",)', "state_names is for 2 values, state_units for 1"),
+        (PLANT, '("theta", "theta_dot")', '("theta", "theta")', "expected a name for each state"),
+        (PLANT, '("theta", "theta_dot")', "(1, 2)", "state_names = (1, 2); expected a name"),
+        (PLANT, STEP, f"mirror: ClassVar = 0.5\n    {STEP}", "mirror = 0.5; expected 1 or -1"),
+        (PLANT, STEP, f"mirror: ClassVar = None\n    {STEP}", "mirror = None; expected 1 or -1"),
+        (PLANT, STEP, f"action_shape: ClassVar = (1, 1)\n    {STEP}", "expected () or (m,)"),
+        (PLANT, STEP, f"action_shape: ClassVar = (1.0,)\n    {STEP}", "expected () or (m,)"),
     ],
 )
 def test_members_of_another_kind_are_refused(shell, text, old, new, says):

@@ -220,9 +220,18 @@ class System(abc.ABC):
         """Raise UsageError for members that are of another kind, or that do not go together."""
         check_members(self, tuple, "state_names", "state_units", "action_shape")
         check_members(self, (int, float), "step_s", "force_limit_n")
-        for name in ("step_s", "force_limit_n"):
-            if not 0 < (value := getattr(self, name)) < math.inf:
-                raise UsageError(f"plant '{self.name}': {name} = {value!r}; expected more than 0")
+        names, words = self.state_names, all(isinstance(name, str) for name in self.state_names)
+        sizes = all(isinstance(size, int) and size > 0 for size in self.action_shape)
+        for name, fits, wanted in (
+            ("step_s", 0 < self.step_s < math.inf, "more than 0"),
+            ("force_limit_n", 0 < self.force_limit_n < math.inf, "more than 0"),
+            ("state_names", words and 0 < len(names) == len(set(names)), "a name for each state"),
+            ("action_shape", sizes and len(self.action_shape) < 2, "() or (m,)"),
+            ("mirror", {*np.ravel(self.mirror).tolist()} <= {1, -1}, "1 or -1 for each force"),
+        ):
+            if not fits:
+                says = f"{name} = {getattr(self, name)!r}; expected {wanted}"
+                raise UsageError(f"plant '{self.name}': {says}")
         for one, other, counts in (
             ("state_names", "state_units", (len(self.state_names), len(self.state_units))),
             ("action_shape", "mirror", (math.prod(self.action_shape), np.size(self.mirror))),
