@@ -142,13 +142,14 @@ def check_same_plant(
     ``what`` names the checkpoint; the settings are those that ``dataset``, where known, brings.
     """
     where = f"dataset {dataset}" if dataset else "the dataset"
-    trained = ["hjepa", "train-encoder", "--dataset", dataset or "DIR"]
-    hint = f"{shell(trained)}, or pass another --dataset DIR"
+    trained = f"train-{'encoder' if what.startswith('encoder') else 'hierarchy'}"
+    again = shell(["hjepa", trained, "--dataset", dataset or "DIR"])
+    hint = f"{again}, or pass another --dataset DIR"
     theirs = metadata["plant"]
     if theirs != settings.plant:
         raise DataError(
-            f"{what} was trained on plant {theirs}, the dataset is of plant {settings.plant}",
-            hint=f"hjepa train-encoder --plant {settings.plant}",
+            f"{what} was trained on plant {theirs}, {where} is of plant {settings.plant}",
+            hint=f"hjepa {trained} --plant {settings.plant}",
         )
     size = camera_in(metadata["settings"])
     if size != settings.camera:

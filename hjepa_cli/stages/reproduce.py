@@ -96,7 +96,7 @@ def parts(settings: Settings) -> list[Plan]:
         counting, counting_s = plan_searches(settings, linked)
     return [
         *(STAGES[name].plan(settings) for name in ("collect", "train-encoder")),
-        train_hierarchy.plan_on(lambda _: (None, "encoder: the one before"), settings),
+        train_hierarchy.plan_on(lambda *_: (None, "encoder: the one before"), settings),
         Plan("eval", [], curves, [], 200_000, 5 + curves_s),
         Plan("scale", [], counting, [], 300_000, 5 + counting_s),
     ]

@@ -60,7 +60,7 @@ def run(
     refuse_recorded(settings, "a posterior is trained in closed loops")
     data = open_training_data(dataset, settings)
     settings = brought_along(settings, data[0].settings, data[0].path)
-    source = open_hierarchy(checkpoint, settings, screen)
+    source = open_hierarchy(checkpoint, settings, screen, data[0].path)
     train, name = functools.partial(train_on, source), "train-fusion"
     return run_training(
         name, out, data, settings, screen, train=train, show=show_fusion, checkpoint=source
@@ -77,8 +77,9 @@ def plan(
     """Plan the rounds of loops and of training."""
     options = settings.fusion
     refuse_recorded(settings, "a posterior is trained in closed loops")
-    _, dataset_line, settings = planned_data(dataset, settings)
-    find = functools.partial(open_hierarchy, checkpoint, settings, Screen(quiet=True))
+    data, dataset_line, settings = planned_data(dataset, settings)
+    quiet, path = Screen(quiet=True), data.path if data else None
+    find = functools.partial(open_hierarchy, checkpoint, settings, quiet, path)
     model, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     loops = 2 * options.rounds * options.devices * options.loop_steps
     shortest, longest = ends_of_gaps(settings.protocol.gaps)
@@ -102,9 +103,11 @@ def plan(
     )
 
 
-def open_hierarchy(name: str | Path | None, settings: Settings, screen: Screen) -> Checkpoint:
+def open_hierarchy(
+    name: str | Path | None, settings: Settings, screen: Screen, dataset: Path | None
+) -> Checkpoint:
     """Open the hierarchy to build on, as :func:`~hjepa_cli.stages.train_reflex.open_model`."""
-    source = open_model(name, settings, screen)
+    source = open_model(name, settings, screen, dataset)
     kind = source.metadata["architecture"]["kind"]
     if kind != "hierarchy":
         raise UsageError(

@@ -103,7 +103,7 @@ def run(
     check_strides(strides.h, strides.m, strides.l)
     data = open_training_data(dataset, settings, h=strides.h)
     settings = brought_along(settings, data[0].settings, data[0].path)
-    source = open_encoder(encoder, settings, screen)
+    source = open_encoder(encoder, settings, screen, data[0].path)
     train, name = partial(train_on, source), "train-hierarchy"
     return run_training(
         name, out, data, settings, screen, train=train, show=show_hierarchy, encoder=source
@@ -119,22 +119,22 @@ def plan(
 ) -> Plan:
     """Plan the loops of the settings' strides on the embeddings of all views of the dataset."""
 
-    def find(asked: Settings) -> tuple[Checkpoint | None, str]:
-        opened = partial(open_encoder, encoder, asked, Screen(quiet=True))
+    def find(asked: Settings, path: Path | None) -> tuple[Checkpoint | None, str]:
+        opened = partial(open_encoder, encoder, asked, Screen(quiet=True), path)
         return found("encoder", opened, encoder, "hjepa train-encoder")
 
     return plan_on(find, settings, dataset, out)
 
 
 def plan_on(
-    find: Callable[[Settings], tuple[Checkpoint | None, str]],
+    find: Callable[[Settings, Path | None], tuple[Checkpoint | None, str]],
     settings: Settings,
     dataset: Path | None = None,
     out: Path | None = None,
 ) -> Plan:
     """Plan for the encoder that is found, or for one that is not trained yet."""
     data, dataset_line, settings = planned_data(dataset, settings)
-    source, encoder_line = find(settings)
+    source, encoder_line = find(settings, data.path if data else None)
     architecture = describe_architecture(settings)
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))
     steps = sum(level_steps(architecture, settings.hierarchy).values())
@@ -224,7 +224,9 @@ def harden(run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit) -> No
     encoder.requires_grad_(False)
 
 
-def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) -> Checkpoint:
+def open_encoder(
+    name: str | Path | None, settings: Settings, screen: Screen, dataset: Path | None = None
+) -> Checkpoint:
     """Open the encoder to build on: the named one, or the newest run's that fits, or the zoo's.
 
     A run fits if its plant and architecture are those of the settings. A checkpoint that is named
@@ -258,7 +260,7 @@ def open_encoder(name: str | Path | None, settings: Settings, screen: Screen) ->
         if name.is_file():
             screen.say(f"no train-encoder run here that fits: encoder of the zoo, {name}")
     checkpoint = load_checkpoint(resolve_model(name))
-    check_same_plant(checkpoint.metadata, settings, f"encoder {checkpoint.path}")
+    check_same_plant(checkpoint.metadata, settings, f"encoder {checkpoint.path}", dataset)
     architecture = checkpoint.metadata.get("architecture")
     if isinstance(architecture, dict) and architecture.get("kind") in ("supervised", "autoencoder"):
         raise DataError(

@@ -91,7 +91,7 @@ def run(
     refuse_recorded(settings, "reflexes are trained on what the teacher does elsewhere")
     data = open_training_data(dataset, settings)
     settings = brought_along(settings, data[0].settings, data[0].path)
-    source = open_model(checkpoint, settings, screen)
+    source = open_model(checkpoint, settings, screen, data[0].path)
     train, name = functools.partial(train_on, source), "train-reflex"
     return run_training(
         name, out, data, settings, screen, train=train, show=show_reflex, checkpoint=source
@@ -109,7 +109,8 @@ def plan(
     refuse_recorded(settings, "reflexes are trained on what the teacher does elsewhere")
     options, protocol = settings.reflex, settings.protocol
     data, dataset_line, settings = planned_data(dataset, settings)
-    find = functools.partial(open_model, checkpoint, settings, Screen(quiet=True))
+    quiet, path = Screen(quiet=True), data.path if data else None
+    find = functools.partial(open_model, checkpoint, settings, quiet, path)
     _, model_line = found("model", find, checkpoint, "hjepa train-hierarchy")
     embedding, amounts = plan_embedding(settings, count_frames(data, settings, *SPLITS))
     plans = len(NETWORKS) * len(views_of(settings, 0, flip=settings.encoder.mirror == "augment"))
@@ -184,7 +185,9 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     return result
 
 
-def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> Checkpoint:
+def open_model(
+    name: str | Path | None, settings: Settings, screen: Screen, dataset: Path | None
+) -> Checkpoint:
     """Open the model to build on: the named one, or the newest run's, or the zoo's.
 
     Raises MissingInputError without one, DataError for another plant's or one without an actor on
@@ -197,13 +200,7 @@ def open_model(name: str | Path | None, settings: Settings, screen: Screen) -> C
             hint="hjepa train-hierarchy, or pass --checkpoint PATH",
         )
     checkpoint = load_checkpoint(path)
-    if checkpoint.metadata["plant"] != settings.plant:
-        raise DataError(
-            f"model {path} drives plant {checkpoint.metadata['plant']}, "
-            f"the dataset is of plant {settings.plant}",
-            hint=f"hjepa train-hierarchy --plant {settings.plant}",
-        )
-    check_same_plant(checkpoint.metadata, settings, f"model {path}")
+    check_same_plant(checkpoint.metadata, settings, f"model {path}", dataset)
     architecture = checkpoint.metadata.get("architecture")
     kind = architecture.get("kind") if isinstance(architecture, dict) else None
     if kind not in ON_EMBEDDINGS:

@@ -533,7 +533,12 @@ def test_models_that_do_not_fit_are_refused(workplace: Path, shell: Shell) -> No
     given = ("train-reflex", "--dataset", data, "--out", "r", "--checkpoint")
     refused = shell(*given, "lone.safetensors")
     assert_one_line_error(refused, 65, "holds no actor", "hjepa train-hierarchy")
-    assert_one_line_error(shell(*given, "gym-h4m2l1"), 65, "drives plant gym")
+    says = f"was trained on plant gym, dataset {data} is of plant desktop"
+    assert_one_line_error(shell(*given, "gym-h4m2l1"), 65, says, "hint: hjepa train-hierarchy")
+    given_to = ("train-hierarchy", "--dataset", data, "--dry-run", "--encoder", "gym-h4m2l1")
+    assert_one_line_error(shell(*given_to), 65, says, "hint: hjepa train-encoder --plant desktop")
+    given_to = ("train-fusion", "--dataset", data, "--dry-run", "--checkpoint", "gym-h4m2l1")
+    assert_one_line_error(shell(*given_to), 65, says, "hint: hjepa train-hierarchy")
     assert_one_line_error(shell(*given, "no-model"), 66, "no-model")
     assert not (shell.directory / "r").exists()
 
