@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -361,6 +362,62 @@ def test_tables_of_other_programs_are_read_or_refused_by_what_is_in_them(shell, 
     outcome = shell("data", "import", root, *SAID, "--out", "d")
     assert outcome.code == 0, outcome
     assert np.array_equal(trajectories(tmp_path / "d").frames, frames[[0]])
+
+
+def test_columns_are_found_by_their_names_in_every_table(shell, tmp_path):
+    """A folder for each episode, whose tables have the columns in another order."""
+    pytest.importorskip("PIL")
+    frames, actions, states = recordings.make(episodes=3, steps=8)
+    for number in range(3):
+        one = slice(number, number + 1)
+        (tmp_path / "r").mkdir(exist_ok=True)
+        recordings.folder(tmp_path / "r" / f"e{number}", frames[one], actions[one], states[one])
+    path = tmp_path / "r" / "e2" / "rows.csv"
+    header, *rows = path.read_text().splitlines()
+    turned = [",".join(reversed(row.split(","))) for row in rows]
+    names = ",".join(reversed(header.split(",")))
+    path.write_text("\n".join([names, *turned]))
+    assert shell("data", "import", "r", *SAID, "--out", "d").code == 0
+    assert_same_rows(
+        trajectories(tmp_path / "d"), *(of[[0, 2]] for of in (frames, actions, states))
+    )
+    path.write_text("\n".join([names.replace("state_1", "state_b"), *turned]))
+    with shell.untouched():
+        refused = shell("data", "import", "r", *SAID, "--out", "e")
+    assert_one_line_error(refused, 2, "e2/rows.csv has no column 'state_1'")
+
+
+def test_pictures_and_episodes_are_found_whatever_their_columns_are_called(shell, tmp_path):
+    """In capitals, or unnamed: by what is in them, else by names with numbers of any length."""
+    pytest.importorskip("PIL")
+    frames, actions, _ = recordings.make(episodes=2, steps=12)
+    root = recordings.folder(tmp_path / "r", frames, actions)
+    for one in root.glob("*.png"):
+        episode, number = one.stem.split("_")
+        one.rename(root / f"{episode}_{int(number)}.png")
+    table = re.sub(r"_0*(\d+)\.png", r"_\1.png", (root / "rows.csv").read_text())
+    header, *rows = table.splitlines()
+    for number, names in enumerate(("Episode,FRAME", "Episode,filename", "episode")):
+        cut = header.replace("episode,frame", names), *rows[::-1]
+        if number == 2:
+            cut = cut[0], *(re.sub(r",\w+\.png", "", row) for row in rows)
+        (root / "rows.csv").write_text("\n".join(cut))
+        assert shell("data", "import", root, *SAID, "--out", f"d{number}").code == 0
+        found = trajectories(tmp_path / f"d{number}")
+        wanted = frames[[0]] if number == 2 else frames[[1], ::-1]
+        assert np.array_equal(found.frames, wanted), names
+
+
+@pytest.mark.parametrize("step_s", [0.0, -0.05])
+def test_times_that_do_not_rise_are_refused_before_any_work(step_s, shell, tmp_path):
+    pytest.importorskip("PIL")
+    root = recordings.folder(tmp_path / "r", *recordings.make(episodes=2, steps=8)[:2])
+    header, *rows = (root / "rows.csv").read_text().splitlines()
+    timed = [f"{row},{step_s * number}" for number, row in enumerate(rows)]
+    (root / "rows.csv").write_text("\n".join([f"{header},Time_s", *timed]))
+    with shell.untouched():
+        refused = shell("data", "import", root, "--limit", 1, *SIZE, "--out", "d")
+    assert_one_line_error(refused, 65, f"does not rise: {1e3 * step_s:g} ms between pictures")
 
 
 def test_the_limits_that_a_refusal_names_are_taken(shell, tmp_path):

@@ -174,6 +174,7 @@
 | 49 | an exposure of more than a step | test_sensor.py::test_what_a_camera_cannot_have_is_refused |
 | 49 | rows of actions that fit alike | test_alignment.py::test_what_is_left_decides |
 | 49 | a column of a table taken twice | test_import.py::test_tables_of_other_programs_are_read_or_refused_by_what_is_in_them |
+| 49 | columns of a table in another order | test_import.py::test_columns_are_found_by_their_names_in_every_table |
 | 50 | forged tag on a hello | test_controller.py::test_another_key_another_model_another_version_and_no_place |
 | 50 | forged tag in a session | test_controller.py::test_a_hundred_thousand_bad_datagrams_change_nothing |
 | 50 | datagram that is doubled, late or reflected | test_controller.py::test_old_doubled_and_foreign_datagrams_change_nothing |

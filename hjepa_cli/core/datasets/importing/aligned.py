@@ -77,6 +77,7 @@ def step_of(recording: Recording, step_s: float | None) -> tuple[float, str]:
 
     Raises:
         UsageError: nobody says.
+        DataError: times do not rise.
     """
     if step_s is not None:
         return step_s, "--fps"
@@ -88,7 +89,10 @@ def step_of(recording: Recording, step_s: float | None) -> tuple[float, str]:
         except DataError:
             continue
         if times_s is not None and len(times_s) > 1:
-            return float(np.median(np.diff(times_s))), TIMES
+            found_s = float(np.median(np.diff(times_s)))
+            if not found_s > 0:
+                raise DataError(f"{TIMES} does not rise: {1e3 * found_s:g} ms between pictures")
+            return found_s, TIMES
         break
     raise UsageError(
         "nobody says how many pictures a second there are", hint="--fps RATE, as --fps 50"

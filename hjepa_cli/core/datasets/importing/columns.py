@@ -13,6 +13,7 @@ from hjepa_cli.errors import DataError, MissingInputError, UsageError
 
 TIMES = ("time_s", "timestamp", "time")
 EPISODE, PICTURE = "episode", ("frame", "file", "image", "picture")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")  # of pictures
 SEPARATORS = ";\t|"  # of other dialects
 BEGINNINGS = {"actions": "action", "states": "state", "expert": "expert"}
 
@@ -41,19 +42,22 @@ class Table:
 
     @property
     def picture(self) -> str | None:
-        """Return the column that names picture files, if there is one."""
-        return next((name for name in PICTURE if name in self.header), None)
+        """Return the column that names picture files, by its name or by what is in it."""
+        columns = zip(self.header, zip(*self.rows, strict=True), strict=False)
+        files = (name for name, of in columns if all(one.lower().endswith(SUFFIXES) for one in of))
+        return self._called(PICTURE) or next(files, None)
 
     @property
     def time(self) -> str | None:
         """Return the column of times in seconds, if there is one."""
-        return next((name for name in TIMES if name in self.header), None)
+        return self._called(TIMES)
 
     def episodes(self) -> dict[str, list[int]]:
         """Return the rows of each episode by its name, in order; all of one without a column."""
-        if EPISODE not in self.header or not self.rows:
+        column = self._called((EPISODE,))
+        if column is None or not self.rows:
             return {"": list(range(len(self.rows)))}
-        place, found = self.header.index(EPISODE), dict[str, list[int]]()
+        place, found = self.header.index(column), dict[str, list[int]]()
         for number, row in enumerate(self.rows):
             found.setdefault(row[place], []).append(number)
         return found
@@ -80,6 +84,16 @@ class Table:
                         f"{self.path}, line {line}: {column} = {text!r} is no number"
                     ) from None
         return values
+
+    def _called(self, names: Sequence[str]) -> str | None:
+        """Return the column of the first of some names that there is, in capitals or not."""
+        spelt = {name.lower(): name for name in reversed(self.header)}
+        return next((spelt[name] for name in names if name in spelt), None)
+
+    @property
+    def chosen(self) -> Chosen:
+        """Return what chooses the same columns in another table."""
+        return Chosen(*(tuple(self.groups[key]) for key in BEGINNINGS))
 
 
 def read(path: Path, chosen: Chosen) -> Table:

@@ -1,17 +1,17 @@
 """A folder holds pictures and a CSV with a row for each; or a folder of that kind per episode."""
 
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hjepa_cli.core.datasets.importing import columns
-from hjepa_cli.core.datasets.importing.columns import Chosen, Table
+from hjepa_cli.core.datasets.importing.columns import SUFFIXES, Chosen, Table
 from hjepa_cli.core.datasets.importing.episode import Episode, Pictures, Recording
 from hjepa_cli.core.datasets.importing.pictures import decoded
 from hjepa_cli.errors import DataError, require
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LOSSY = (".jpg", ".jpeg", ".webp")
 
 
@@ -26,7 +26,10 @@ def read(directory: Path, chosen: Chosen) -> Recording:
         DataError: there is no CSV, or an unsound one.
     """
     require("PIL", "pictures need Pillow", "import")
-    tables = [(path, columns.read(path, chosen)) for path in csv_files(directory)]
+    tables: list[tuple[Path, Table]] = []
+    for path in csv_files(directory):  # the first says which columns are an action's in all
+        alike = tables[0][1].chosen if tables else chosen
+        tables.append((path, columns.read(path, alike)))
     if not tables:
         raise DataError(f"{directory} and its folders hold no CSV file")
     entries: list[tuple[str, Callable[[], Episode]]] = []
@@ -93,7 +96,9 @@ def _episode(name: str, root: Path, table: Table, rows: list[int]) -> Episode:
 
 
 def _beside(path: Path) -> list[Path]:
-    return sorted(one for one in path.parent.iterdir() if one.suffix.lower() in SUFFIXES)
+    """Return the pictures beside a table; ``9.png`` comes before ``10.png``."""
+    found = (one for one in path.parent.iterdir() if one.suffix.lower() in SUFFIXES)
+    return sorted(found, key=lambda one: re.sub(r"\d+", lambda of: of[0].zfill(20), one.name))
 
 
 def _stream(name: str, paths: Sequence[Path], start: int) -> Pictures:

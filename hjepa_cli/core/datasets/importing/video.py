@@ -31,11 +31,12 @@ def read(path: Path, chosen: Chosen) -> Recording:
             "second; expected one rate",
             hint="import them one by one",
         )
+    alike = columns.read(films[0].with_suffix(".csv"), chosen).chosen
     entries: list[tuple[str, Callable[[], Episode]]] = []
     for film in films:
         name = f"episode {film.name}"
-        entries.append((name, partial(_episode, name, film, chosen)))
-    names = tuple(columns.read(films[0].with_suffix(".csv"), chosen).groups["states"])
+        entries.append((name, partial(_episode, name, film, alike)))
+    names = alike.states or ()
     lossy = any(_about(film)["codec"] not in LOSSLESS for film in films)
     return Recording("video", entries, 1 / rates.pop(), state_names=names, lossy=lossy)
 
