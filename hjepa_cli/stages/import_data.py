@@ -195,7 +195,7 @@ def task_of(
         camera: see :class:`Task`.
 
     Raises:
-        UsageError: a size that networks cannot read.
+        UsageError: a size that networks cannot read, or a test of what is trained on.
     """
     sources = {"train": source, "test": test, "clean": clean}
     named = (None if some is None else tuple(some) for some in (actions, states, expert))
@@ -210,6 +210,12 @@ def task_of(
         skip_bad=skip_bad,
     )
     paths = {split: str(path.absolute()) for split, path in sources.items() if path}
+    for split in ("test", "clean"):
+        if split in paths and Path(paths[split]).resolve() == source.resolve():
+            raise UsageError(
+                f"--{split} {sources[split]} is what is trained on",
+                hint=f"leave out --{split}: --held-out holds some of it out",
+            )
     return Task(paths, kind, Chosen(*named), camera, options)
 
 

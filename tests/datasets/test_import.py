@@ -464,10 +464,32 @@ def test_values_that_make_no_sense_are_refused(shell, tmp_path):
         "recorded.mirror": ("--mirror-signs", "1,0.5"),
         "no middle": ("--mirror-signs", "-1,1", "--size", 24, 41),
         "trajectories of 2 to 7": ("--steps", 40),
+        "--states and --expert name columns": ("--states", "x"),
+        "--camera chooses among those of a LeRobotDataset": ("--camera", "front"),
+        "--test r.npz is what is trained on": ("--test", "r.npz"),
+        "--clean r.npz is what is trained on": ("--clean", "r.npz"),
     }.items():
         with shell.untouched():
             args = (*SAID, *given, "--out", "d")
             assert_one_line_error(shell("data", "import", "r.npz", *args), 2, words)
+
+
+def test_arrays_of_some_episodes_only_or_of_no_real_numbers_are_refused(shell, tmp_path):
+    frames, actions, states = recordings.make(episodes=3, steps=8)
+    arrays = {f"frames_{n}": frames[n] for n in range(3)}
+    arrays |= {f"actions_{n}": actions[n] for n in range(3)}
+    for given, words in (
+        (arrays | {"states_1": states[1]}, "3 episodes with pictures, 1 with states"),
+        (arrays | {"actions_1": actions[1] * 1j}, "episode 1: actions are no real numbers"),
+    ):
+        np.savez(tmp_path / "r.npz", **given)
+        with shell.untouched():
+            refused = shell("data", "import", "r.npz", *SAID, "--out", "d")
+        assert_one_line_error(refused, 65, words)
+    np.savez(tmp_path / "r.npz", frames=frames, actions=actions, expert=actions / 2)
+    assert shell("data", "import", "r.npz", *SAID, "--out", "d").code == 0
+    found = trajectories(tmp_path / "d")
+    assert np.array_equal(found.teacher_n, found.applied_n / 2)
 
 
 IMPORT = [sys.executable, "-m", "hjepa_cli", "data", "import"]

@@ -70,9 +70,11 @@ def table(values: Any, name: str, what: str) -> Floats:
         DataError: they are no numbers, or their shape is another one.
     """
     try:
+        if np.iscomplexobj(values):
+            raise TypeError
         rows = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise DataError(f"{name}: {what} are not numbers") from None
+        raise DataError(f"{name}: {what} are no real numbers") from None
     if rows.ndim == 1:
         rows = rows[:, None]
     if rows.ndim != 2 or not rows.shape[1]:

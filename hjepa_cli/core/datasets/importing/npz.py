@@ -20,7 +20,7 @@ SKIP_BYTES = 2**20
 COLUMNS = {  # what we call a column, and what others do
     "actions": ("actions", "action"),
     "states": ("states", "state"),
-    "expert": ("expert_actions", "expert_action", "teacher_action"),
+    "expert": ("expert_actions", "expert_action", "teacher_action", "expert"),
 }
 PICTURES = ("frames", "pixels")
 ABOUT = "hjepa"  # what an export of ours says of itself
@@ -158,7 +158,7 @@ def _read(path: Path, archive: _Archive) -> Recording:
         columns = {
             key: [Member(archive, one[key]).all() for one in members if key in one]
             for key in COLUMNS
-            if key in members[0]
+            if any(key in one for one in members)
         }
         pictures = [Member(archive, f"frames{suffix}") for suffix in suffixes]
         return arrays.recording(pictures, columns, **about)

@@ -16,6 +16,7 @@ FORMATS: Mapping[str, Callable[[Path, Chosen, str | None], Recording]] = {
     "lerobot": lerobot.read,
     "minari": lambda path, chosen, camera: hdf5.read_minari(path),
 }
+TABLES = ("folder", "video", "lerobot")  # whose columns can be chosen
 
 
 def open_recording(path: Path, kind: str | None, chosen: Chosen, camera: str | None) -> Recording:
@@ -23,12 +24,18 @@ def open_recording(path: Path, kind: str | None, chosen: Chosen, camera: str | N
 
     Raises:
         MissingInputError: there is nothing, or what reads it is not installed.
-        UsageError: it is of no known format, or a column that was named is not there.
+        UsageError: it is of no known format, or a column that was named is not there, or could not
+            be.
         DataError: it is unsound.
     """
     if not path.exists():
         raise MissingInputError(f"{path} does not exist")
-    return FORMATS[kind or format_of(path)](path, chosen, camera)
+    kind = kind or format_of(path)
+    if chosen != Chosen() and kind not in TABLES:
+        raise UsageError(f"--actions, --states and --expert name columns; {path} is of {kind}")
+    if camera is not None and kind != "lerobot":
+        raise UsageError(f"--camera chooses among those of a LeRobotDataset; {path} is of {kind}")
+    return FORMATS[kind](path, chosen, camera)
 
 
 def format_of(path: Path) -> str:
