@@ -179,12 +179,14 @@ class Planner:
 class Controller:
     def __init__(self, devices): pass
     def act(self, delivered, packets): return ACT
-    def planned_n(self): return self.nothing_like_it
+    def planned_n(self): return TOLD
+    def ahead_n(self): return TOLD
 
 def build(settings, model):
     made = {"last": functools.partial(LastForce, lambda z: ACT), "own": Controller}.get(KIND, id)
     driver = embedding_driver("mine", settings, model, made, family="mine")
-    return {"bits": dataclasses.replace(driver, bits_per_transmission=-7), "": 7}.get(KIND, driver)
+    changed = {"bits": {"bits_per_transmission": -7}, "none": {"controller": None}}.get(KIND, {})
+    return dataclasses.replace(driver, **changed) if KIND else 7
 
 def any(architecture, plant): return True
 
@@ -215,6 +217,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("planner", "None", "TypeError: cannot unpack"),
         ("number", "0", "'int' object has no attribute 'act'$"),
         ("bits", "0", "bits_per_transmission = -7; expected a whole number of at least 0$"),
+        ("none", "0", "its driver's controller = None is no function$"),
         ("", "0", r"build\(…\) made 7; expected a Driver$"),
     ],
 )
@@ -258,6 +261,34 @@ def test_what_else_a_plugin_s_controller_tells_names_it_too(
     assert controller.stride_steps == 2 and not controller.act(np.ones(4, bool), z).any()
     with pytest.raises(UsageError, match=r"mine.py: method 'mine': follow\(…\) is \(1, \d+\)"):
         controller.act(np.ones(4, bool), z, np.full(4, 2))
+
+
+@pytest.mark.parametrize(
+    ("told", "planned", "ahead"),
+    [
+        ("None", r"planned_n\(\) is \(\) of object", r"ahead_n\(\) is \(\) of object"),
+        ("[0.0]", r"\(1,\) of float64; .* \(4,\)$", r"\(1,\) of float64; .* \(4, 16\)$"),
+        ("torch.zeros(4, 9, 1)", r"\(4, 9, 1\) .* \(4,\)$", r"\(4, 9, 1\) .* \(4, 9\)$"),
+        ("torch.zeros(4) / 0", r"planned_n\(\)\[0\] is nan", r"\(4,\) .* \(4, 16\)$"),
+        ("torch.zeros(4, 9) / 0", r"\(4, 9\) .* \(4,\)$", r"ahead_n\(\)\[0, 0\] is nan"),
+    ],
+)
+def test_forces_that_a_controller_tells_of_are_looked_at_too(
+    tmp_path: Path, checkpoint: Path, told: str, planned: str, ahead: str
+) -> None:
+    loaded(tmp_path, "import torch" + ANSWERS.replace("KIND", "'own'").replace("TOLD", told))
+    model = Model.load(checkpoint, "cpu")
+    controller: Any = build_driver("mine", tiny(("mine",)), model).controller(4)
+    for asked, says in ((controller.planned_n, planned), (controller.ahead_n, ahead)):
+        with pytest.raises(UsageError, match=rf"^plugin .*mine\.py: method 'mine': .*{says}"):
+            asked()
+
+
+def test_what_a_method_says_of_its_models_names_it(tmp_path: Path, checkpoint: Path) -> None:
+    text = ANSWERS.replace("def any(architecture, plant)", "def any(architecture)")
+    loaded(tmp_path, text.replace("KIND", "'own'"))
+    with pytest.raises(UsageError, match=r"mine\.py: method 'mine': TypeError: any\(\) takes 1"):
+        methods_of(Model.load(checkpoint, "cpu"))
 
 
 @pytest.mark.parametrize(

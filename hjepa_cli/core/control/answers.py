@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hjepa_cli.core.arrays import Bools, Floats, check_answer, finite
 from hjepa_cli.core.control.codecs.codec import Coder
+from hjepa_cli.core.control.link import AHEAD_STEPS
 from hjepa_cli.core.control.loop import Controller
 from hjepa_cli.core.plants.guarded import guarded
 from hjepa_cli.errors import ArrayError
@@ -36,13 +37,20 @@ class GuardedController:
     def __getattr__(self, name: str) -> Any:
         """Return what else the controller tells, as the forces that it has planned."""
         found = getattr(self._controller, name)
-        return self._guard(found) if name in ("planned_n", "ahead_n") else found
+        if name not in ("planned_n", "ahead_n"):
+            return found
+        return self._guard(lambda: self._forces(found(), f"{name}()", ahead=name == "ahead_n"))
 
     def _act(self, delivered: Bools, packets: Any, *ages: Any) -> Floats:
         act: Any = self._controller.act
-        forces_n = np.asarray(act(delivered, packets, *ages))
-        check_answer(forces_n, self._shape, "act(…)")
-        finite(forces_n, "act(…)")
+        return self._forces(act(delivered, packets, *ages), "act(…)")
+
+    def _forces(self, answer: Any, name: str, *, ahead: bool = False) -> Floats:
+        """Return forces [n, *A], or those of steps ``ahead`` [n, L, *A], of any L."""
+        forces_n, (devices, *action) = np.asarray(answer), self._shape
+        steps = forces_n.shape[1:2] or (AHEAD_STEPS,)
+        check_answer(forces_n, (devices, *(steps if ahead else ()), *action), name)
+        finite(forces_n, name)
         return forces_n
 
 

@@ -106,6 +106,10 @@ def _of_plugin(name: str, driver: Driver, action_shape: tuple[int, ...]) -> Driv
     """Return a driver that a plugin built, whose answers are looked at."""
     if not isinstance(driver, Driver):
         raise METHODS.fault(name, f"method '{name}': build(…) made {driver!r}; expected a Driver")
+    for member in ("sensor", "controller", "reactive"):
+        if not callable(made := getattr(driver, member)):
+            says = f"its driver's {member} = {made!r} is no function"
+            raise METHODS.fault(name, f"method '{name}': {says}")
     bits = driver.bits_per_transmission
     if not (isinstance(bits, Integral) and bits >= 0):
         says = f"bits_per_transmission = {bits!r}; expected a whole number of at least 0"

@@ -25,7 +25,14 @@ from hjepa_cli.core.datasets.importing.prepared import Options, Prepared, prepar
 from hjepa_cli.core.plants.named import camera_in, plant_in
 from hjepa_cli.core.plants.recorded import RecordedCamera
 from hjepa_cli.core.plants.system import System
-from hjepa_cli.errors import DataError, HjepaError, MissingInputError, NumericalError, UsageError
+from hjepa_cli.errors import (
+    DataError,
+    HjepaError,
+    MissingInputError,
+    NumericalError,
+    UsageError,
+    shell,
+)
 from hjepa_cli.storage import files, seals
 from hjepa_cli.storage import tensors as arrays
 from hjepa_cli.storage.shards import LOG, Described, Shard
@@ -381,7 +388,10 @@ def load_dataset(path: Path, plant_name: str | None = None) -> Dataset:
     if not path.exists():
         raise MissingInputError(f"dataset {path} does not exist", hint="hjepa collect")
     if not (path / MANIFEST).is_file():
-        raise DataError(f"{path} is not an hjepa dataset: no {MANIFEST}", hint="hjepa collect")
+        raise DataError(
+            f"{path} is not an hjepa dataset: no {MANIFEST}",
+            hint=f"hjepa collect, or of a recording {shell(['hjepa', 'data', 'import', path])}",
+        )
     manifest = files.read_json(path / MANIFEST)
     if manifest.get("format") != FORMAT:
         raise DataError(f"{path} is not an hjepa dataset: its {MANIFEST} is of another program")

@@ -10,9 +10,10 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from hjepa_cli.core.plants.guarded import guarded
 from hjepa_cli.core.style import Style
 from hjepa_cli.errors import UsageError, choices
-from hjepa_cli.plugins import check_members
+from hjepa_cli.plugins import METHODS, check_members
 
 if TYPE_CHECKING:
     from torch import nn
@@ -87,7 +88,8 @@ class Method:
     def offers(self, architecture: Architecture, plant: System) -> tuple[str, ...]:
         """Return its name where a model of the architecture offers it to the plant."""
         own = self.kind is not None and architecture["kind"] == self.kind
-        return (self.name,) if own or self.offered(architecture, plant) else ()
+        offered = guarded(METHODS, self.name, self.offered)
+        return (self.name,) if own or offered(architecture, plant) else ()
 
 
 @dataclasses.dataclass(frozen=True)
