@@ -6,6 +6,7 @@ at once.
 
 import contextlib
 import os
+import re
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -28,7 +29,7 @@ from hjepa_cli.errors import (
 )
 from hjepa_cli.output.screen import Screen, one_line
 from hjepa_cli.output.streams import Lasting, PipeClosed, lasting_streams
-from hjepa_cli.plugins import blamed, in_force, load_file
+from hjepa_cli.plugins import STAGES, blamed, in_force, load_file
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -69,8 +70,8 @@ def _run_command(
             nowhere = streams.enter_context(open(os.devnull, "w"))
             for redirect in (contextlib.redirect_stdout, contextlib.redirect_stderr):
                 streams.enter_context(redirect(nowhere))
-        for path in _plugins(argv):  # one may add a command
-            load_file(path)
+        for path in _given(argv, "--plugin"):  # one may add a command
+            load_file(Path(path))
         returned = get_command(build(argv)).main(argv, prog_name="hjepa", standalone_mode=False)
         return returned if isinstance(returned, int) else 0
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # the last resort
@@ -81,6 +82,7 @@ def _run_command(
         if "--debug" in argv or os.environ.get("HJEPA_DEBUG", "0") not in ("", "0"):
             traceback.print_exc()
         failure = _expected(error, argv)
+        failure.hint = _with_plugins(failure.hint, argv)
     if isinstance(failure, PipeClosed):
         return failure.exit_code
     if follows and not isinstance(failure, torchrun.OneOfSeveral):
@@ -94,13 +96,26 @@ def _run_command(
     return failure.exit_code
 
 
-def _plugins(argv: Sequence[str]) -> Iterator[Path]:
-    """Yield the files that ``--plugin`` names anywhere on a command line."""
+def _given(argv: Sequence[str], name: str) -> Iterator[str]:
+    """Yield the paths that a flag names anywhere on a command line."""
     words = iter(argv)
     for word in words:
         flag, sign, path = word.partition("=")
-        if flag == "--plugin" and (path := path if sign else next(words, "")):
-            yield Path(path)
+        if flag == name and (path := path if sign else next(words, "")):
+            yield path
+
+
+def _with_plugins(hint: str | None, argv: Sequence[str]) -> str | None:
+    """Return a hint whose stages are given the plugins and settings files of this command.
+
+    Without them its plant is unknown to them, or they take another one.
+    """
+    flags = ("--plugin", "--config")
+    own = shell([word for flag in flags for path in _given(argv, flag) for word in (flag, path)])
+    if hint is None or "--plugin" in hint or "--plugin" not in own:
+        return hint
+    stages = "|".join(map(re.escape, STAGES))
+    return re.sub(rf"\bhjepa ({stages})(?![\w-])", lambda of: f"{of[0]} {own}", hint)
 
 
 def _usage(argv: list[str]) -> str:

@@ -415,3 +415,17 @@ def test_a_collection_goes_on_with_the_plant_that_it_was_begun_with(shell):
         assert_one_line_error(outcome, 2, "begun with plugin mine.py, which has changed", "delete")
     Path("mine.py").write_text(text)
     assert shell("resume", "c", "--plugin", "mine.py").code == 0
+
+
+def test_hints_are_of_the_plant_that_a_plugin_adds(shell):
+    """Without it the next step would be refused, or take the default's plant."""
+    Path("my plant.py").write_text(PLANT)
+    Path("c.toml").write_text(SMALL)
+    given = ("--plugin=my plant.py", "--config", "c.toml")
+    own = "--plugin 'my plant.py' --config c.toml"
+    for command, hint in (
+        (("train-encoder",), f"hjepa collect {own} --plant pendulum, or pass --dataset DIR"),
+        (("eval", "--methods", "hjepa", "--workers", "0"), f"hjepa train-hierarchy {own}"),
+    ):
+        outcome = shell(*command, *given)
+        assert outcome.code == 66 and outcome.err.endswith(f"hint: {hint}\n"), outcome.err

@@ -198,8 +198,9 @@ def test_foreign_directories_are_refused(tmp_path: Path, path: Path) -> None:
         load_dataset(tmp_path / "gone")
     assert caught.value.hint == "hjepa collect"
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match=r"empty is not an hjepa dataset: no dataset\.json"):
+    with pytest.raises(DataError, match=r"empty is not an hjepa dataset: no dataset\.json") as said:
         load_dataset(tmp_path / "empty")
+    assert f"hjepa data import {tmp_path / 'empty'}" in str(said.value.hint)  # if it is a recording
     with pytest.raises(DataError, match="is not an hjepa dataset"):
         load_dataset(path / MANIFEST)
     (tmp_path / "empty" / MANIFEST).write_text('{"format": "other", "schema": 1}')
