@@ -164,6 +164,30 @@ def test_members_of_another_kind_are_refused(shell, text, old, new, says):
     refused(shell, text.replace(old, new), says)
 
 
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        ("pole_mass_kg=0", "a number above 0"),
+        ("half_length_m=-0.2", "a number above 0"),
+        ("gravity_m_s2=float('nan')", "a number above 0"),
+        ("pole_width_m='0.02'", "a number above 0"),
+        ("substeps=2.5", "a number above 0"),
+        ("window_m=1.2", "2 numbers above 0"),
+        ("cart_size_m=(0.1, 0)", "2 numbers above 0"),
+        ("state_weights=(1, 1, 1, -1)", "4 numbers above 0"),
+    ],
+)
+def test_a_cart_pole_that_cannot_be_is_refused(shell, change, wanted):
+    made = (
+        "import dataclasses\nfrom hjepa_cli import register\n"
+        "from hjepa_cli.core.plants.named import plant\n"
+        "register(dataclasses.replace(plant('desktop'), name='mine', {}))"
+    )
+    refused(shell, made.format(change), f"plant 'mine': {change.partition('=')[0]} = ", wanted)
+    Path("good.py").write_text(made.format("substeps=4, state_weights=(1, 0, 9.0, 0)"))
+    assert plugins.load_file(Path("good.py")).name == "good.py"
+
+
 def test_a_family_that_makes_something_else_is_named(shell):
     made = "CodecFamily('mine-N', lambda name: 8 if name == 'mine-8' else None, 'mine-N')"
     Path("bad.py").write_text(

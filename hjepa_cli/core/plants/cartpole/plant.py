@@ -1,6 +1,7 @@
 """Cart-poles are plants: ``desktop``, the paper's at 1 ms, and ``gym``, Gymnasium's at 20 ms."""
 
 import dataclasses
+import math
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -13,10 +14,12 @@ from hjepa_cli.core.plants.cartpole.teacher import sdre
 from hjepa_cli.core.plants.cost import stage_cost
 from hjepa_cli.core.plants.frames import WIDTH_PX
 from hjepa_cli.core.plants.system import System, Teacher, runge_kutta_step
+from hjepa_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from hjepa_cli.core.plants.cartpole.simulation import CartPoles
 
+SIZES = {"state_weights": 4, "window_m": 2, "cart_size_m": 2}  # of the other numbers there is one
 SCORE_X_M = 0.05
 SCORE_THETA_RAD = 0.05
 
@@ -27,6 +30,21 @@ class CartPolePlant(CartPoleParameters, System):
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "rad", "rad/s")
+
+    def check_members(self) -> None:
+        """Raise UsageError for numbers that no cart-pole has: a weight may be 0, all else not."""
+        super().check_members()
+        for field in dataclasses.fields(CartPoleParameters):
+            count, value = SIZES.get(field.name, 1), getattr(self, field.name)
+            if field.name in ("name", "discrete_teacher"):
+                continue
+            found = np.asarray(value, object).ravel().tolist()
+            real = int if field.name == "substeps" else (int, float)
+            sound = all(isinstance(one, real) and 0 <= one < math.inf for one in found)
+            if len(found) != count or not sound or (0 in found and field.name != "state_weights"):
+                wanted = "a number above 0" if count == 1 else f"{count} numbers above 0"
+                says = f"{field.name} = {value!r}; expected {wanted}"
+                raise UsageError(f"plant '{self.name}': {says}")
 
     def simulation(self, devices: int, *, mass_scale: ArrayLike | None = None) -> "CartPoles":
         """Simulate by pymunk; ``mass_scale`` is of cart and pole."""
