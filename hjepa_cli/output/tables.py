@@ -15,9 +15,12 @@ def measured(value: float | None) -> str:
 
 
 def ranked(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Mapping[str, Any]]]]:
-    """Return device counts by method, with its scheduler where it has one, the most first."""
+    """Return device counts by method, with its scheduler where it has one, the most first.
+
+    Those of a method ascend with the SNR, in whatever order it was asked for.
+    """
     by_method: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
+    for row in sorted(rows, key=lambda row: row["snr_db"]):
         names = (row["method"], row.get("scheduler"))
         by_method.setdefault(", ".join(filter(None, names)), []).append(row)
     return sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))

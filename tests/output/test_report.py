@@ -90,7 +90,7 @@ def evaluated(name=None, plant="desktop"):
     return finished("eval", document, name=name)
 
 
-def scaled():
+def scaled(**changes):
     rows = [
         {
             "snr_db": snr,
@@ -109,7 +109,7 @@ def scaled():
         "acceptable_score": 0.62, "rows": rows, "gains": [gain | {"ratio_ci95": [2.0, None]}],
         "paper_gain_percent": 42.83, "checkpoint": None, "seed": 0, "n_devices": 256,
     }  # fmt: skip
-    return finished("scale", document)
+    return finished("scale", document | changes)
 
 
 def trained():
@@ -455,6 +455,19 @@ def test_runs_that_no_report_shows_are_refused(shell):
 
 
 # --- the page
+
+
+def test_counts_stand_below_their_snr_in_whatever_order_it_was_asked_for(shell, without_figures):
+    row = {"method": "hold", "bits_per_s": None, "at_least": False}
+    counts = {30.0: 2481, 10.0: 861, 20.0: 1657}  # as of --snr 30,10,20
+    rows = [
+        row | {"snr_db": snr_db, "devices": n, "devices_ci95": [n, n]}
+        for snr_db, n in counts.items()
+    ]
+    shell("report", scaled(rows=rows, gains=[]))
+    texts = "|".join(filter(str.strip, Reader(Path("report.html").read_text()).texts))
+    assert "|10 dB|20 dB|30 dB|" in texts
+    assert "|hold|861 (861 – 861)|1657 (1657 – 1657)|2481 (2481 – 2481)" in texts
 
 
 def test_the_result_comes_first_and_stages_in_their_order(shell, without_figures):
