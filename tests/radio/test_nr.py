@@ -269,6 +269,22 @@ def test_laws_count_on_it():
     assert EQUAL.row(one, cell, 20.0)["devices"] == layer().shared_by(0.02, INT8, 20.0, "fixed")
 
 
+def test_links_that_fade_have_no_allocation_and_need_no_target_met():
+    """At −5 dB no MCS keeps a target; fades above that still let a device in fifty through."""
+    uplink = layer()
+    cell = Cell(20e6, 1e-3, 13.2, phy=uplink)
+    loop = LinkRequirement("hjepa", 0.02, (0.03, 0.02), False, INT8, 0, 1000, 3000)
+    row = EQUAL.row(loop, cell, -5.0)
+    # Alone in one of 2 n parts, on 51 // n PRBs: who falls below no MCS' threshold, one by one.
+    works = [uplink._delivery(51 // n, INT8, -5.0, "fixed") >= 0.02 for n in range(1, 52)]
+    assert row["devices"] == 2 * sum(works) > 0
+    assert row["bits_per_s"] == pytest.approx(0.02 * INT8 / 1e-3)
+    assert row["reason"] is None and "mcs" not in row
+    stuck = Cell(20e6, 1e-3, 13.2, phy=layer(mcs=27))
+    reason = EQUAL.row(dataclasses.replace(loop, tolerance=0.9), stuck, 5.0)["reason"]
+    assert reason.startswith("one device alone delivers with p = ")
+
+
 def test_nothing_fits_below_the_lowest_mcs_and_it_says_why():
     cell = Cell(20e6, 1e-3, 13.2, phy=layer())
     loop = LinkRequirement("hjepa", 100.0, (90.0, 110.0), False, INT8, 0, 1000, 3000)
@@ -317,6 +333,8 @@ def test_what_the_standard_does_not_have_is_refused(radio, changes, match):
         ({"phy": "nr", "overhead_bits": 24, "law": "scheduled"}, {}, {}, "physical layer shannon"),
         ({"speed_m_s": 3.0, "law": "scheduled"}, {}, {}, "for --fading jakes, tdl"),
         ({"fading": "jakes"}, {}, {}, "for the law scheduled"),
+        ({"phy": "nr", "law": "equal"}, {}, {"harq_rounds": 4}, "for the law duty or scheduled"),
+        ({"phy": "nr", "law": "equal"}, {"nr.grants": 1}, {}, "--grants is for the law duty"),
         (
             {"fading": "jakes", "law": "scheduled", "coherence_slots": 4.0}, {}, {},
             "for --fading block",

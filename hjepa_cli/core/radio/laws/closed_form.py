@@ -11,7 +11,7 @@ from typing import Any
 
 from hjepa_cli.core.plants.guarded import guarded
 from hjepa_cli.core.radio.cell import Cell, Link
-from hjepa_cli.core.radio.laws.law import Row, SharingLaw
+from hjepa_cli.core.radio.laws.law import HELD_LINKS, Row, SharingLaw
 from hjepa_cli.core.radio.laws.requirement import Axis, LinkRequirement
 from hjepa_cli.plugins import LAWS, check_members
 
@@ -25,6 +25,8 @@ class ClosedFormLaw(SharingLaw):
     """Counts by formulas of a tolerance, the loop that it was measured on and the link.
 
     Attributes:
+        uses: as of :class:`SharingLaw`. Without :data:`HELD_LINKS` links fade around γ̄, and rows
+            do not say what a packet is sent on at γ̄.
         axis: of the tolerance that it reads.
         devices: how many share the cell when each tolerates as much.
         packets_per_slot: how many of a device's packets then arrive; by default 1/D* or p*.
@@ -32,7 +34,7 @@ class ClosedFormLaw(SharingLaw):
         delay_slots: how late the packets are that a method must be measured with.
     """
 
-    uses: tuple[str, ...] = ("remeasure", "dataset")
+    uses: tuple[str, ...] = ("remeasure", "dataset", *HELD_LINKS)
     axis: Axis
     devices: Callable[[float, LinkRequirement, Link], int]
     packets_per_slot: Callable[[float, LinkRequirement, Link], float] | None = None
@@ -88,10 +90,12 @@ class ClosedFormLaw(SharingLaw):
         ends = loop.interval or (loop.tolerance, loop.tolerance)
         row["devices"] = self.asked("devices", *at)
         row["devices_ci95"] = [self.asked("devices", end, loop, link) for end in ends]
-        row |= link.carried.details
-        if link.packets_per_slot == 0:
-            return row | {"reason": link.carried.described}
-        row["load_per_block"] = row["devices"] / link.packets_per_slot
+        if set(HELD_LINKS) <= set(self.uses):
+            row |= link.carried.details
+            if link.packets_per_slot == 0:
+                return row | {"reason": link.carried.described}
+        if link.packets_per_slot:
+            row["load_per_block"] = row["devices"] / link.packets_per_slot
         if row["devices"] == 0:
             # The range of a method ends at its best link, too, if it was measured nowhere else.
             fails = loop.tolerance == self.axis.fails_at and not loop.at_least

@@ -7,6 +7,12 @@ from hjepa_cli.plugins import check_members
 
 Row = dict[str, Any]  # of ``scale --json``
 
+# Read of links that power control holds at γ̄, where what a packet is sent on follows from it.
+HELD_LINKS = (
+    *("nr.bler_target", "nr.link_adaptation", "nr.cqi_age_slots", "nr.harq_rounds"),
+    *("nr.harq_rtt_slots", "nr.grants", "nr.grants_per_slot"),
+)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SharingLaw:

@@ -8,7 +8,7 @@ import dataclasses
 from hjepa_cli.core.radio.capacity import whole_devices
 from hjepa_cli.core.radio.cell import Cell
 from hjepa_cli.core.radio.channel import ROUNDING
-from hjepa_cli.core.radio.laws.law import Row, SharingLaw
+from hjepa_cli.core.radio.laws.law import HELD_LINKS, Row, SharingLaw
 from hjepa_cli.core.radio.phy.phy import Carried
 from hjepa_cli.plugins import SCHEDULERS
 
@@ -20,7 +20,7 @@ SCHEDULED = SharingLaw(
         *("radio.coherence_slots", "radio.overhead_bits", "radio.block_error"),
         *("radio.harq_rounds", "radio.topology", "radio.scenario", "radio.carrier_ghz"),
         *("radio.power_dbm", "radio.noise_figure_db", "radio.fading", "radio.speed_m_s"),
-        *("radio.delay_spread_s", "nr.reports"),
+        *("radio.delay_spread_s", "nr.reports", *HELD_LINKS),
     ),
 )
 
