@@ -214,6 +214,19 @@ def test_repetition_costs_what_it_sends_and_waits():
     assert twice.round_trip_slots == 2
 
 
+def test_a_fixed_mcs_may_need_copies_to_get_through_at_all():
+    """At 15 dB MCS 27 is lost once sent; two, three, four copies have 18.0, 19.8, 21.0 dB."""
+    sent = layer(mcs=27, harq_rounds=4).carries(INT8, 15.0)
+    errors = layer()._errors
+    block = nr_module.transport_block(3, 144, 6, 948 / 1024)
+    lost = errors.rate(27 - 3, block.code_block_bits, 15.0 + 10 * np.log10([1, 2, 3, 4]))
+    assert lost[0] == 1.0 and lost[-1] < 0.01
+    per_packet = 1 + lost[:-1].sum()  # transmissions, as left after 1, 2, 3 copies
+    assert sent.packets_per_slot == pytest.approx(2 * 17 * (1 - lost[-1]) / per_packet)
+    once = layer(mcs=27).carries(INT8, 15.0)
+    assert once.described == "at 15 dB every block of MCS 27 is lost"
+
+
 def test_an_outer_loop_keeps_the_target_that_aged_knowledge_misses():
     """Against a Monte Carlo of two correlated fades, and against Sionna's own outer loop's rule."""
     radio = dataclasses.replace(RADIO, fading="jakes", speed_m_s=3.0)

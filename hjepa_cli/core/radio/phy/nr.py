@@ -248,7 +248,7 @@ class NrUplink:
         held = left[0] if outer else self._block_errors(snr_db, np.zeros(1))
         usable = self._permitted[:, None] & (held <= target)
         if self._nr.mcs >= 0:  # not adapted: whatever gets lost
-            usable = self._permitted[:, None] & (left[0] < 1.0)
+            usable = self._permitted[:, None] & (left[-1] < 1.0)
         room = np.where(usable, self._blocks.bits, 0)
         most = int(room.max()) - self.overhead_bits
         if most <= 0:
@@ -331,6 +331,8 @@ class NrUplink:
 
     def _why_nothing(self, snr_db: float) -> str:
         lowest = int(self._errors.mcs[self._permitted][0])
+        if self._nr.mcs >= 0:
+            return f"at {snr_db:g} dB every block of MCS {lowest} is lost"
         return (
             f"at {snr_db:g} dB not even MCS {lowest} of table {self._nr.mcs_table} keeps a block "
             f"error rate of {self._nr.bler_target:g}"
