@@ -41,7 +41,6 @@ TOPOLOGIES = {
 }
 DEFAULT_NR = NrSettings()
 # What is read of fading of some kinds only; all but "block" have a Doppler.
-DOPPLER = ("radio.speed_m_s", "radio.delay_spread_s")
 FADINGS = {
     "radio.speed_m_s": ("jakes", "tdl"),
     "radio.delay_spread_s": ("tdl",),
@@ -213,7 +212,8 @@ def check_cell(
     """
     flags = [key for key, value in given.items() if value not in (None, False)]
     unlike = changed(radio) | changed(nr, "nr")
-    aged = radio.phy == "nr" and nr.cqi_age_slots > 0
+    # Aged knowledge is of one fade, whatever the law; only a simulation has taps.
+    aged = radio.phy == "nr" and nr.cqi_age_slots > 0 and radio.fading in ("block", "jakes")
     for key in dict.fromkeys((*flags, *unlike)):
         flag = flag_of(declared()[key]) if key in declared() else None
         named = f"{key} = {unlike.get(key)!r}"
@@ -228,7 +228,7 @@ def check_cell(
                 key=where,
             )
         laws = [law for law in LAWS if key in LAWS[law].uses]
-        moves = aged and key in (*DOPPLER, "radio.fading", "radio.carrier_ghz")
+        moves = aged and key in ("radio.fading", "radio.speed_m_s", "radio.carrier_ghz")
         if laws and radio.law not in laws and not moves:
             raise UsageError(
                 f"{named} is for the law {' or '.join(laws)}, this is {radio.law}",
@@ -264,7 +264,32 @@ def check_cell(
             hint="set block_error in --config FILE.toml, or leave out harq_rounds",
             key="radio.harq_rounds",
         )
+    if radio.phy == "nr":
+        _check_nr(radio, nr)
     PHYS[radio.phy].check(radio, nr)
+
+
+def _check_nr(radio: RadioSettings, nr: NrSettings) -> None:
+    """Raise UsageError for what was set of an NR uplink and other settings of it leave no use."""
+    schedulers = [SCHEDULERS[name] for name in radio.schedulers if radio.law == "scheduled"]
+    adapts, decides = nr.mcs < 0, any(not one.in_turn for one in schedulers)
+    needs = {
+        "nr.bler_target": (adapts or nr.reports == "grant", "an MCS that adapts"),
+        "nr.link_adaptation": (
+            adapts and nr.cqi_age_slots > 0,
+            "--cqi-age-slots and an MCS that adapts",
+        ),
+        "nr.grants_per_slot": (decides or nr.grants == "dynamic", "--grants dynamic"),
+        "nr.reports": (any(one.wants_reports for one in schedulers), "a scheduler as innovation"),
+    }
+    for key, value in changed(nr, "nr").items():
+        read, what = needs.get(key, (True, ""))
+        if not read and (flag := flag_of(declared()[key])):
+            raise UsageError(
+                f"{flag.name} {value} is for {what}; nothing reads it here",
+                hint=f"leave out {flag.name}",
+                key=key,
+            )
 
 
 def fits_fading(fading: str, fades: Sequence[str]) -> bool:

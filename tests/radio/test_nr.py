@@ -346,6 +346,21 @@ def test_what_the_standard_does_not_have_is_refused(radio, changes, match):
         ({"phy": "nr", "overhead_bits": 24, "law": "scheduled"}, {}, {}, "physical layer shannon"),
         ({"speed_m_s": 3.0, "law": "scheduled"}, {}, {}, "for --fading jakes, tdl"),
         ({"fading": "jakes"}, {}, {}, "for the law scheduled"),
+        ({"phy": "nr"}, {}, {"mcs": 10, "bler_target": 0.01}, "0.01 is for an MCS that"),
+        ({"phy": "nr"}, {}, {"link_adaptation": "outer"}, "is for --cqi-age-slots and"),
+        ({"phy": "nr"}, {}, {"grants_per_slot": 4}, "is for --grants dynamic"),
+        (
+            {"phy": "nr", "law": "scheduled", "schedulers": ("max-aoi",)}, {}, {"reports": "free"},
+            "is for a scheduler as innovation",
+        ),
+        (
+            {"phy": "nr", "fading": "jakes", "delay_spread_s": 1e-7}, {}, {"cqi_age_slots": 4.0},
+            "delay_spread_s = 1e-07 is for the law scheduled",
+        ),
+        (
+            {"phy": "nr", "fading": "tdl-d"}, {}, {"cqi_age_slots": 4.0},
+            "fading = 'tdl-d' is for the law scheduled",
+        ),
         ({"phy": "nr", "law": "equal"}, {}, {"harq_rounds": 4}, "for the law duty or scheduled"),
         ({"phy": "nr", "law": "equal"}, {"nr.grants": 1}, {}, "--grants is for the law duty"),
         (
@@ -361,6 +376,19 @@ def test_what_the_standard_does_not_have_is_refused(radio, changes, match):
 def test_what_is_not_read_is_refused(radio, given, nr, match):
     with pytest.raises(UsageError, match=match):
         check_cell(RadioSettings(**radio), given, NrSettings(**nr))
+
+
+@pytest.mark.parametrize(
+    ("radio", "nr"),
+    [
+        ({"fading": "jakes", "speed_m_s": 3.0, "carrier_ghz": 2.0}, {"cqi_age_slots": 4.0}),
+        ({"law": "scheduled", "schedulers": ("round-robin", "max-aoi")}, {"grants_per_slot": 4}),
+        ({"law": "scheduled"}, {"reports": "grant", "mcs": 10, "bler_target": 0.01}),
+        ({}, {"grants": "dynamic", "grants_per_slot": 4, "harq_rtt_slots": 8}),
+    ],
+)
+def test_what_is_read_is_taken(radio, nr):
+    check_cell(dataclasses.replace(RADIO, **radio), {}, NrSettings(**nr))
 
 
 def test_without_sionna_one_line_says_so(monkeypatch):
