@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from hjepa_cli.output.screen import percent, span
+from hjepa_cli.output.tables import described_cell
 from hjepa_cli.plugins import METHODS
 
 MOST_COLUMNS = 8  # of a table beside the first, so that it is never cut on paper
@@ -106,7 +107,7 @@ def _of_scale(result: Mapping[str, Any]) -> str:
             at.setdefault(row["method"], row)
     best = at.pop("hjepa") if "hjepa" in at else at.pop(next(iter(at)))
     count = span(best["devices"], best["devices_ci95"], 0, "≥" if best["at_least"] else "")
-    said = f"One cell of {result['bandwidth_hz'] / 1e6:g} MHz supports {count} devices "
+    said = f"One cell ({described_cell(result)}) supports {count} devices "
     said += f"with {best['method']} at {at_db:g} dB"
     compared = [f"{row['devices']:.0f} with {name}" for name, row in at.items() if row["devices"]]
     return f"{'; '.join([said, *compared])}. In brackets: 95 % interval."

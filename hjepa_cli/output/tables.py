@@ -7,6 +7,7 @@ from hjepa_cli.core.control.force_error import WINDOWS
 from hjepa_cli.core.control.link import described
 from hjepa_cli.core.evaluation.protocol import BESIDE
 from hjepa_cli.output.screen import Screen, described_steps, span, tolerance
+from hjepa_cli.plugins import LAWS, PHYS
 
 
 def measured(value: float | None) -> str:
@@ -24,6 +25,16 @@ def ranked(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Mapping[st
         names = (row["method"], row.get("scheduler"))
         by_method.setdefault(", ".join(filter(None, names)), []).append(row)
     return sorted(by_method.items(), key=lambda item: -(item[1][-1]["devices"] or 0))
+
+
+def described_cell(result: Mapping[str, Any]) -> str:
+    """Return the cell of a result of ``scale`` in a few words."""
+    law = f"{result['law']} law{described(result.get('link', {}))}"
+    if result.get("noise") == "scaled" and "radio.noise" in LAWS[result["law"]].uses:
+        law += ", scaled noise"
+    if (phy := result.get("phy", "shannon")) != "shannon":
+        law += f", {PHYS[phy].help}" if phy in PHYS else f", {phy}"
+    return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
 
 
 def show_gates(screen: Screen, gates: dict[str, dict[str, Any]], *, enforced: bool) -> None:

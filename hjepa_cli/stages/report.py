@@ -15,12 +15,14 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template, UndefinedError
 
 from hjepa_cli import __version__
+from hjepa_cli.core.control import link
 from hjepa_cli.core.plants.named import plant, plant_in
 from hjepa_cli.errors import MissingInputError, UsageError, shell
 from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.page import explained, gain_rows, headline, methods_of, parts
 from hjepa_cli.output.screen import Screen, can_draw, described_steps, in_order, span, tolerance
 from hjepa_cli.output.tables import (
+    described_cell,
     offline_columns,
     offline_rows,
     ranked,
@@ -158,9 +160,9 @@ def page_template() -> Template:
         "sprintf": lambda value, text: text % value,
     }
     named = (gates, in_order, ranked, span, tolerance, windows, explained, gain_rows, methods_of)
-    tables = (offline_columns, offline_rows, stress_columns, stress_rows)
+    tables = (described_cell, offline_columns, offline_rows, stress_columns, stress_rows)
     environment.globals |= {one.__name__: one for one in (*named, *tables, parts)}
-    environment.globals["version"] = __version__
+    environment.globals |= {"version": __version__, "link_described": link.described}
     return environment.get_template("report.html.j2")
 
 

@@ -143,6 +143,7 @@ class _Evaluation(msgspec.Struct):
     acceptable_lq_ratio: Number = 0.0
     source: str = ""
     stress: _Stress | None = None
+    link: dict[str, Number] = {}
 
 
 class _OfflineEntry(msgspec.Struct):
@@ -194,6 +195,9 @@ class _Scale(msgspec.Struct):
     gains: list[_Gain]
     csv: str = ""
     figures: list[str] = []
+    phy: str = "shannon"
+    noise: str = "fixed"
+    link: dict[str, Number] = {}
 
 
 class _Lost(msgspec.Struct):
@@ -237,6 +241,7 @@ class _Survival(msgspec.Struct):
     rows: Annotated[list[_SurvivalTime], Meta(min_length=1)]
     curves: Annotated[list[_Losses], Meta(min_length=1)]
     figures: list[str] = []
+    link: dict[str, Number] = {}
 
 
 class _Wire(msgspec.Struct):

@@ -24,13 +24,13 @@ from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.screen import Screen, can_draw
-from hjepa_cli.output.tables import ALLOCATION, show_allocations
+from hjepa_cli.output.tables import ALLOCATION, described_cell, show_allocations
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.stages import results
 from hjepa_cli.stages.evaluate import reads_of
 from hjepa_cli.stages.measuring import plan_curves, seconds_of_loops
 from hjepa_cli.stages.plan import Plan, run_directory
-from hjepa_cli.stages.scale_by_formula import ByFormula, described
+from hjepa_cli.stages.scale_by_formula import ByFormula
 from hjepa_cli.stages.scale_by_simulation import BySimulation
 from hjepa_cli.stages.scale_by_tolerance import ByTolerance, refuse_measuring
 from hjepa_cli.stages.verification import enforce
@@ -256,6 +256,6 @@ def draw(result: Mapping[str, Any], asked: Looks, directory: Path, screen: Scree
         return []
     from hjepa_cli.output import figures
 
-    usual = f"{described(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI"
+    usual = f"{described_cell(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI"
     figure = figures.scale_figure(result, dataclasses.replace(asked, title=asked.titled(usual)))
     return [figures.save(figure, directory / f"devices.{kind}") for kind in figures.METADATA]

@@ -8,7 +8,6 @@ from typing import Any
 
 from hjepa_cli.config.checks import late
 from hjepa_cli.config.schema import Settings
-from hjepa_cli.core.control import link
 from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.evaluation.device_ratios import best_flat, best_reflex, gain
 from hjepa_cli.core.evaluation.protocol import Point
@@ -19,8 +18,8 @@ from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.output.screen import Screen, described_steps, percent, span
-from hjepa_cli.output.tables import ranked
-from hjepa_cli.plugins import LAWS, METHODS, PHYS
+from hjepa_cli.output.tables import described_cell, ranked
+from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.evaluate import open_measurable
 from hjepa_cli.stages.measuring import curves_for, measure_points
 from hjepa_cli.stages.verification import VERIFY_AT, show_verdicts, verdict
@@ -115,7 +114,7 @@ class ByFormula:
             ],
         )
         screen.table(
-            f"devices: {described(result)}; 95 % CI",
+            f"devices: {described_cell(result)}; 95 % CI",
             ["method", *(f"{row['snr_db']:g} dB" for row in counts[0][1])],
             [[method, *(_span(row, "devices", 0, "≥") for row in rows)] for method, rows in counts],
         )
@@ -188,16 +187,6 @@ class ByFormula:
             if possible and (inside or not loop.at_least):
                 sides.append((share, value, inside))
         return sides
-
-
-def described(result: Mapping[str, Any]) -> str:
-    """Return the cell of a result in a few words."""
-    law = f"{result['law']} law{link.described(result.get('link', {}))}"
-    if result.get("noise") == "scaled" and "radio.noise" in LAWS[result["law"]].uses:
-        law += ", scaled noise"
-    if (phy := result.get("phy", "shannon")) != "shannon":
-        law += f", {PHYS[phy].help}" if phy in PHYS else f", {phy}"
-    return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
 
 
 def _span(row: Row, key: str, digits: int, bound: str) -> str | None:

@@ -20,10 +20,10 @@ from hjepa_cli.core.evaluation.workers import open_workers
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.errors import MissingInputError
 from hjepa_cli.output.screen import Screen, span
+from hjepa_cli.output.tables import described_cell
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.block_loads import BlockLoads
 from hjepa_cli.stages.model_set import open_model_set
-from hjepa_cli.stages.scale_by_formula import described
 from hjepa_cli.stages.verification import show_verdicts
 from hjepa_cli.storage.runs import Run
 
@@ -160,7 +160,7 @@ class BySimulation:
         if result["fading"] != "block":
             fades = f"{result['fading']} at {result['speed_m_s']:g} m/s"
         screen.table(
-            f"devices: {described(result)}, payload {result['payload']}, {links}, {fades}",
+            f"devices: {described_cell(result)}, payload {result['payload']}, {links}, {fades}",
             ["method, scheduler", *(f"{snr_db:g} dB" for snr_db in grid_db)],
             [
                 [label, *(_span(count[label, at], "devices", "devices_ci95", 0) for at in grid_db)]

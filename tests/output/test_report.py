@@ -84,10 +84,10 @@ def finished(stage, result, metrics=(), name=None, inputs=None):
         return record.directory
 
 
-def evaluated(name=None, plant="desktop"):
+def evaluated(name=None, plant="desktop", **changes):
     methods = {"hjepa": entry(0.95), EVIL: entry(0.5)}
     document = {"plant": plant, "seed": 0, "checkpoint": f"m/{EVIL}", "methods": methods}
-    return finished("eval", document, name=name)
+    return finished("eval", document | changes, name=name)
 
 
 def scaled(**changes):
@@ -468,6 +468,19 @@ def test_counts_stand_below_their_snr_in_whatever_order_it_was_asked_for(shell, 
     texts = "|".join(filter(str.strip, Reader(Path("report.html").read_text()).texts))
     assert "|10 dB|20 dB|30 dB|" in texts
     assert "|hold|861 (861 – 861)|1657 (1657 – 1657)|2481 (2481 – 2481)" in texts
+
+
+def test_a_report_names_the_layer_and_the_link_that_counts_are_for(shell, without_figures):
+    late = {"delay_steps": 30, "jitter_steps": 10, "downlink_loss": 0.2, "confirmation_bits": 48}
+    cell = "duty law, packets 30 to 40 steps late, 20 % of the forces lost, a 5G NR uplink, 20 MHz"
+    shell("report", scaled(phy="nr", link=late))
+    texts = [" ".join(one.split()) for one in Reader(Path("report.html").read_text()).texts]
+    headline = f"One cell ({cell}, 1 ms slots) supports 2220 (2220 – 2227) devices with hjepa at 20"
+    assert any(one.startswith(headline) for one in texts)
+    assert any(one.startswith(f"Devices per cell: {cell}") for one in texts)
+    shell("report", evaluated(link=late))
+    page_text = " ".join(Path("report.html").read_text().split())
+    assert "packets 30 to 40 steps late, 20 % of the forces lost. Score and LQ ratio" in page_text
 
 
 def test_the_result_comes_first_and_stages_in_their_order(shell, without_figures):
