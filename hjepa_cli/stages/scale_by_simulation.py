@@ -14,7 +14,7 @@ from hjepa_cli.config.checks import check_schedulable, check_warmup
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control import link
 from hjepa_cli.core.control.loop import check_memory
-from hjepa_cli.core.evaluation.device_ratios import best_flat, ratio_of
+from hjepa_cli.core.evaluation.device_ratios import best_flat, comparable, ratio_of
 from hjepa_cli.core.evaluation.load_search import BLOCK_DEVICES
 from hjepa_cli.core.evaluation.workers import open_workers
 from hjepa_cli.core.radio.laws.law import Row
@@ -107,6 +107,7 @@ class BySimulation:
         """Compare schedulers with round robin, methods being equal, and ``hjepa`` with its rivals.
 
         The rivals are the best flat predictor and the oracle; all three with their best scheduler.
+        Counts that are bounds are not compared.
         """
         at = [row for row in rows if row["snr_db"] == snr_db and row["devices"]]
         pairs = [
@@ -125,6 +126,7 @@ class BySimulation:
         return [
             {"snr_db": snr_db, "method": _label(row), "over": _label(rival), **ratio_of(row, rival)}
             for row, rival in pairs
+            if comparable(row, rival)
         ]
 
     def show(self, result: Mapping[str, Any]) -> None:

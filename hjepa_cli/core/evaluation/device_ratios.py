@@ -11,15 +11,20 @@ from hjepa_cli.plugins import METHODS
 
 
 def gain(rows: Sequence[Row], method: str, over: str, snr_db: float) -> Row | None:
-    """Return the ratio of two methods' devices at one SNR; ``None`` where one has none.
+    """Return the ratio of two methods' devices; ``None`` where one has none, or has a bound only.
 
     Returns:
         ``snr_db``, ``method``, ``over``, ``ratio``, ``ratio_ci95`` (``None``: unbounded above).
     """
     at = {row["method"]: row for row in rows if row["snr_db"] == snr_db and row["devices"]}
-    if method not in at or over not in at:
+    if method not in at or over not in at or not comparable(at[method], at[over]):
         return None
     return {"snr_db": snr_db, "method": method, "over": over, **ratio_of(at[method], at[over])}
+
+
+def comparable(above: Row, below: Row) -> bool:
+    """Tell whether two rows with devices have a ratio: of a bound there is none."""
+    return not (above["at_least"] or below["at_least"])
 
 
 def ratio_of(above: Row, below: Row) -> Row:
