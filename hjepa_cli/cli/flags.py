@@ -18,6 +18,7 @@ from msgspec import Meta
 from hjepa_cli.cli import completion
 from hjepa_cli.config.schema import (
     LARGEST,
+    LONGEST_GAP_STEPS,
     Count,
     CountFromTwo,
     CountOrNone,
@@ -362,7 +363,7 @@ _LOOP = {
 }
 _RADIO = {
     "tolerance_steps": Input(
-        Annotated[float, Meta(ge=1, le=LARGEST)],
+        Annotated[float, Meta(ge=1, le=LONGEST_GAP_STEPS)],
         "--tolerance-steps",
         "Count devices whose packets may come so many control steps apart, and measure nothing: "
         "where no closed loop exists.",

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
+LONGEST_GAP_STEPS = 1e8  # that somebody may state: with the widest band counts stay in range
 LARGEST = sys.float_info.max  # bounds what is not bounded otherwise: no infinity, no NaN
 LARGEST_SEED = 2**63 - 1
 RECORDED = "recorded"  # the plant of imported datasets

@@ -115,7 +115,7 @@ def draw_devices(
         )
     drawn = [row for row in rows if row["devices"]]
     least = min((row["devices"] for row in drawn), default=1)
-    most = max((row["devices_ci95"][1] for row in drawn), default=1)
+    most = max((points[:, 3].max() for points in curves.values()), default=0) or 1
     if asked.logarithmic():
         axes.set_yscale("log", nonpositive="clip")
         axes.set_ylim(0.7 * least, 1.5 * most)
@@ -177,7 +177,7 @@ def schedulers_figure(rows: Sequence[Mapping[str, Any]], asked: Looks = looks.PL
             style = SCHEDULERS[scheduler].style if scheduler in SCHEDULERS else PLAIN
             how = {"linestyle": style.line, "linewidth": 0.7, "capsize": 1.5}
             draw_bars(axes, style, snr_db, *devices, label=asked.named(scheduler), **how)
-        most = max(row["devices_ci95"][1] for row in rows if row["method"] == method)
+        most = _curves(rows)[method][:, 3].max()
         if asked.logarithmic():
             axes.set_yscale("log", nonpositive="clip")
         else:
@@ -223,7 +223,8 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     curves: dict[str, list[list[float]]] = {}
     for row in rows:
         if row["devices"] is not None:
-            point = [row["snr_db"], row["devices"], *row["devices_ci95"]]
+            ends = row["devices_ci95"] or [row["devices"]] * 2  # of a stated gap: no interval
+            point = [row["snr_db"], row["devices"], *ends]
             curves.setdefault(row["method"], []).append(point)
     return {method: np.array(sorted(points), float) for method, points in curves.items()}
 

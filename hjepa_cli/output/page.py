@@ -110,7 +110,8 @@ def _of_scale(result: Mapping[str, Any]) -> str:
     said = f"One cell ({described_cell(result)}) supports {count} devices "
     said += f"with {best['method']} at {at_db:g} dB"
     compared = [f"{row['devices']:.0f} with {name}" for name, row in at.items() if row["devices"]]
-    return f"{'; '.join([said, *compared])}. In brackets: 95 % interval."
+    said = f"{'; '.join([said, *compared])}."
+    return said if best["devices_ci95"] is None else f"{said} In brackets: 95 % interval."
 
 
 def _of_survival(result: Mapping[str, Any]) -> str:

@@ -268,11 +268,16 @@ def one_line(text: str) -> str:
 def span(
     value: float | None, interval: Sequence[float] | None, decimals: int, bound: str = ""
 ) -> str | None:
-    """Set a number with its interval, ``112.5 (104.1 – 118.0)``, or one-sided, ``≥ 320.0 (…)``."""
+    """Set a number with its interval, ``112.5 (104.1 – 118.0)``, or one-sided, ``≥ 320.0 (…)``.
+
+    A number that was stated, not measured, has none: ``100.0``.
+    """
     if value is None:
         return None
-    low, high = interval or (value, value)
     text = f"{bound} {value:.{decimals}f}" if bound else f"{value:.{decimals}f}"
+    if interval is None:
+        return text
+    low, high = interval
     return f"{text} ({low:.{decimals}f} – {high:.{decimals}f})"
 
 

@@ -37,6 +37,18 @@ def described_cell(result: Mapping[str, Any]) -> str:
     return f"{law}, {result['bandwidth_hz'] / 1e6:g} MHz, {result['slot_s'] * 1e3:g} ms slots"
 
 
+def counted_by(result: Mapping[str, Any]) -> str:
+    """Return what the devices of a result of ``scale`` were counted by."""
+    if steps := result.get("tolerance_steps"):
+        return f"a packet every {described_gap(steps)}, as stated"
+    return f"score ≥ {result['acceptable_score']:g}, 95 % CI"
+
+
+def described_gap(steps: float) -> str:
+    """Return a gap in words: ``1 step``, ``2.5 steps``."""
+    return f"{steps:g} step" + "s" * (steps != 1)
+
+
 def show_gates(screen: Screen, gates: dict[str, dict[str, Any]], *, enforced: bool) -> None:
     """Print a row per gate."""
     rows = [

@@ -22,6 +22,7 @@ from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.page import explained, gain_rows, headline, methods_of, parts
 from hjepa_cli.output.screen import Screen, can_draw, described_steps, in_order, span, tolerance
 from hjepa_cli.output.tables import (
+    counted_by,
     described_cell,
     offline_columns,
     offline_rows,
@@ -160,8 +161,9 @@ def page_template() -> Template:
         "sprintf": lambda value, text: text % value,
     }
     named = (gates, in_order, ranked, span, tolerance, windows, explained, gain_rows, methods_of)
-    tables = (described_cell, offline_columns, offline_rows, stress_columns, stress_rows)
-    environment.globals |= {one.__name__: one for one in (*named, *tables, parts)}
+    tables = (offline_columns, offline_rows, stress_columns, stress_rows)
+    cell = (counted_by, described_cell)
+    environment.globals |= {one.__name__: one for one in (*named, *tables, *cell, parts)}
     environment.globals |= {"version": __version__, "link_described": link.described}
     return environment.get_template("report.html.j2")
 
@@ -326,7 +328,8 @@ def scale_figures(result: Result, config: Mapping[str, Any], run: Path, asked: L
     """Draw devices against the SNR."""
     from hjepa_cli.output import figures
 
-    caption = f"Supported devices, law {result['law']}, 95 % intervals"
+    caption = f"Supported devices, law {result['law']}"
+    caption += "" if result.get("tolerance_steps") else ", 95 % intervals"
     return {"devices": (caption, figures.scale_figure(result, asked))}
 
 

@@ -197,6 +197,7 @@ class _Scale(msgspec.Struct):
     figures: list[str] = []
     phy: str = "shannon"
     noise: str = "fixed"
+    tolerance_steps: Positive | None = None
     link: dict[str, Number] = {}
 
 

@@ -24,7 +24,7 @@ from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.looks import Looks
 from hjepa_cli.output.screen import Screen, can_draw
-from hjepa_cli.output.tables import ALLOCATION, described_cell, show_allocations
+from hjepa_cli.output.tables import ALLOCATION, counted_by, described_cell, show_allocations
 from hjepa_cli.plugins import LAWS
 from hjepa_cli.stages import results
 from hjepa_cli.stages.evaluate import reads_of
@@ -256,6 +256,6 @@ def draw(result: Mapping[str, Any], asked: Looks, directory: Path, screen: Scree
         return []
     from hjepa_cli.output import figures
 
-    usual = f"{described_cell(result)}; score ≥ {result['acceptable_score']:g}, 95 % CI"
+    usual = f"{described_cell(result)}; {counted_by(result)}"
     figure = figures.scale_figure(result, dataclasses.replace(asked, title=asked.titled(usual)))
     return [figures.save(figure, directory / f"devices.{kind}") for kind in figures.METADATA]

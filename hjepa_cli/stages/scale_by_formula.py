@@ -18,7 +18,7 @@ from hjepa_cli.core.radio.laws.closed_form import ClosedFormLaw
 from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.output.screen import Screen, described_steps, percent, span
-from hjepa_cli.output.tables import described_cell, ranked
+from hjepa_cli.output.tables import counted_by, described_cell, ranked
 from hjepa_cli.plugins import METHODS
 from hjepa_cli.stages.evaluate import open_measurable
 from hjepa_cli.stages.measuring import curves_for, measure_points
@@ -114,7 +114,7 @@ class ByFormula:
             ],
         )
         screen.table(
-            f"devices: {described_cell(result)}; 95 % CI",
+            f"devices: {described_cell(result)}; {counted_by(result)}",
             ["method", *(f"{row['snr_db']:g} dB" for row in counts[0][1])],
             [[method, *(_span(row, "devices", 0, "≥") for row in rows)] for method, rows in counts],
         )

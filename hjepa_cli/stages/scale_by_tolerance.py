@@ -7,7 +7,7 @@ from; what a packet costs is known all the same.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import LONGEST_GAP_STEPS, Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control import link
 from hjepa_cli.core.plants.named import plant_of
@@ -17,6 +17,7 @@ from hjepa_cli.core.radio.laws.law import Row
 from hjepa_cli.core.radio.laws.requirement import LinkRequirement
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
+from hjepa_cli.output.tables import described_gap
 from hjepa_cli.plugins import CODECS
 from hjepa_cli.stages.model_set import ModelSet, load_first, under_law_of
 from hjepa_cli.stages.scale_by_formula import ByFormula
@@ -38,7 +39,7 @@ class ByTolerance(ByFormula):
     """Counts devices whose packets come a stated number of steps apart; the model says their bits.
 
     Raises:
-        UsageError: a gap of less than a step.
+        UsageError: a gap of less than a step, or of more than counts can take.
     """
 
     def __init__(
@@ -49,8 +50,9 @@ class ByTolerance(ByFormula):
         tolerance_steps: float,
         checkpoint: str | None = None,
     ) -> None:
-        if not tolerance_steps >= 1:
-            raise UsageError(f"--tolerance-steps {tolerance_steps:g}; expected at least 1")
+        if not 1 <= tolerance_steps <= LONGEST_GAP_STEPS:
+            allowed = f"expected 1 to {LONGEST_GAP_STEPS:g}"
+            raise UsageError(f"--tolerance-steps {tolerance_steps:g}; {allowed}")
         path, model = load_first(settings, screen, checkpoint)
         if model:
             settings = under_law_of(model, settings)
@@ -61,7 +63,7 @@ class ByTolerance(ByFormula):
         embedding = model.architecture["embedding"] if model else settings.encoder.embedding
         told = link.confirmation_bits(settings.protocol, len(self._kind.force_signs))
         self._bits = CODECS[settings.protocol.payload].bits(embedding) + told
-        self._name = f"{tolerance_steps:g} steps"
+        self._name = described_gap(tolerance_steps)
 
     def measured_methods(self, grid_db: Sequence[float]) -> dict[float, list[str]]:
         """Return no method: nothing is measured."""
@@ -86,7 +88,7 @@ class ByTolerance(ByFormula):
             "checkpoint": self.models.path,
             "checkpoints": {},
             "skipped": {},
-            "source": f"{self._steps:g} steps between packets as stated, not measured",
+            "source": f"{self._name} between packets as stated, not measured",
             "slot_s": self._kind.step_s,
             "tolerance_steps": self._steps,
             "n_devices": 0,

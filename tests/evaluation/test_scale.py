@@ -8,14 +8,17 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from test_device_counts import entry
 
 from hjepa_cli.config.checks import split_late
+from hjepa_cli.config.schema import LONGEST_GAP_STEPS
 from hjepa_cli.config.settings import load_settings
+from hjepa_cli.core.plants.named import plant
 from hjepa_cli.errors import MissingInputError, NumericalError, UsageError
 from hjepa_cli.output.screen import Screen
-from hjepa_cli.stages import scale, scale_by_formula
+from hjepa_cli.stages import report, scale, scale_by_formula
 
 ENTRIES = {
     "hjepa": entry(gap=112.0, p=0.02),
@@ -129,6 +132,39 @@ def test_a_stated_gap_is_charged_as_the_protocol_starts(tmp_path, monkeypatch, s
     c, steps = 20e6 * 1e-3 * math.log2(101) / 2064, settings.protocol.steps
     extra = 0 if start == "steady" else 1 - 1 / 320
     assert row["devices"] == math.floor(c * steps / (steps / 320 + extra))
+
+
+def test_a_stated_gap_has_no_interval_and_no_score(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(scale, "draw", lambda *ignored: [])  # half a second each
+    monkeypatch.setattr(report, "draw", lambda *ignored: {})
+    screen = Screen(stdout=(out := io.StringIO()), stderr=io.StringIO())
+    settings = load_settings(flags={"radio.snr_db": "20"})
+    given = {"tolerance_steps": 2.5, "checkpoint": "desktop-h4m2l1"}
+    [row] = scale.run(settings, screen, **given, out=Path("s"))["rows"]
+    count = math.floor(2.5 * 20e6 * 1e-3 * math.log2(101) / 2064)
+    assert row["devices"] == count and row["devices_ci95"] is row["tolerance_ci95"] is None
+    printed = out.getvalue()
+    assert "a packet every 2.5 steps, as stated" in " ".join(printed.split())
+    assert f" {count}\n" in printed and "95 %" not in printed and "score" not in printed
+    with open("s/devices.csv", newline="") as file:
+        assert [line["devices_ci95_low"] for line in csv.DictReader(file)] == [""]
+    report.run(screen, [Path("s")], out=Path("r.html"))
+    assert "95 %" not in Path("r.html").read_text().partition("<h3>")[0]
+
+
+@pytest.mark.parametrize("steps", [0.5, 1e9, math.inf, math.nan])
+def test_a_gap_that_counts_cannot_take_is_refused(steps):
+    for run in (scale.run, scale.plan):
+        screen = {"screen": Screen(True)} if run is scale.run else {}
+        with pytest.raises(UsageError, match=r"expected 1 to 1e\+08"):
+            run(load_settings(), **screen, tolerance_steps=steps)
+
+
+def test_the_widest_band_and_the_longest_gap_stay_in_range():
+    widest = load_settings(flags={"radio.bandwidth_hz": 1e11, "radio.snr_db": "100"})
+    c = 1e11 * plant("gym").step_s * math.log2(1 + 1e10)  # of packets of a bit
+    assert LONGEST_GAP_STEPS * c < np.iinfo(np.int64).max and widest.radio.bandwidth_hz == 1e11
 
 
 @pytest.mark.parametrize(

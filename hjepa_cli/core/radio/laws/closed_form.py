@@ -87,9 +87,9 @@ class ClosedFormLaw(SharingLaw):
         if loop.payload_bits == 0:
             return row | {"reason": "sends nothing: as many as there are, without this cell"}
         at = loop.tolerance, loop, (link := cell.link(loop.payload_bits, snr_db))
-        ends = loop.interval or (loop.tolerance, loop.tolerance)
         row["devices"] = self.asked("devices", *at)
-        row["devices_ci95"] = [self.asked("devices", end, loop, link) for end in ends]
+        if loop.interval is not None:
+            row["devices_ci95"] = [self.asked("devices", end, loop, link) for end in loop.interval]
         if set(HELD_LINKS) <= set(self.uses):
             row |= link.carried.details
             if link.packets_per_slot == 0:
