@@ -229,6 +229,7 @@ class _SurvivalTime(msgspec.Struct):
     tolerated_loss: Probability
     tolerated_loss_bursts: Probability
     devices: Whole
+    snr_db: Number
 
 
 class _Survival(msgspec.Struct):

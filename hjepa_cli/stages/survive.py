@@ -292,7 +292,8 @@ def show(result: Mapping[str, Any], screen: Screen) -> None:
     hours = result["mean_time_h"]
     screen.table(
         f"survival times; availability and loss of a link that loses control once in {hours:g} h; "
-        f"devices in {result['bandwidth_hz'] / 1e6:g} MHz, {result['phy']}",
+        f"devices at {result['rows'][0]['snr_db']:g} dB in {result['bandwidth_hz'] / 1e6:g} MHz, "
+        f"{result['phy']}",
         [
             *("method", "transfer interval [ms]", "survival time [ms]", "of", "D* [ms]"),
             *("availability", "loss", "in bursts", "devices"),

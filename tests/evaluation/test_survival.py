@@ -1,5 +1,6 @@
 """Survival times: schedules, counts, intervals, splitting, links; and the stage."""
 
+import io
 import json
 import math
 
@@ -196,6 +197,9 @@ def test_the_stage_ranks_prediction_over_holding(tmp_path, monkeypatch):
     assert again["rows"] == json.loads(json.dumps(result["rows"]))
     assert "drive 24 loops" in survive.plan(settings).work[0]
     report.run(Screen(quiet=True), [tmp_path / "runs"], out=tmp_path / "report.html")
+    survive.show(result, Screen(stdout=(printed := io.StringIO())))
+    for shown in (printed.getvalue(), (tmp_path / "report.html").read_text()):
+        assert "devices at 20 dB in 20 MHz, shannon" in " ".join(shown.split())
     for edit in ({"step_s": 0}, {"rows": []}, {"curves": None}, {"n_loops": "many"}):
         path = tmp_path / "runs" / "survive" / "0001" / "result.json"
         whole = path.read_text()
