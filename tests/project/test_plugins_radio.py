@@ -60,7 +60,7 @@ def test_a_scheduler_from_a_file(load):
     loads = {(row["method"], row["scheduler"]): row["load_per_block"] for row in result["rows"]}
     assert len(loads) == 4 and min(loads.values()) > 1
     assert "oracle, patient" in out.getvalue()
-    assert ("oracle, patient", "oracle, round-robin") in {
+    assert ("hold-true, patient", "hold-true, round-robin") in {
         (gain["method"], gain["over"]) for gain in result["gains"]
     }
     pytest.importorskip("matplotlib")
