@@ -89,6 +89,16 @@ class Asked:
         middle, lasts_s = self.steps // 2, KILLED_S if self.harm == "kill" else STOPPED_S
         return range(middle, middle + round(lasts_s / period_s))
 
+    def check(self, step_s: float) -> None:
+        """Raise UsageError for a harm that lasts longer than the run."""
+        silent = self.silence(self.period_s(step_s))
+        if silent and silent.stop >= self.steps:
+            raise UsageError(
+                f"--harm {self.harm} keeps the server silent from step {silent.start} to "
+                f"{silent.stop} of {self.steps}",
+                hint=f"--steps {2 * len(silent) + 1} or more, to see devices driven again",
+            )
+
 
 def run(
     settings: Settings,
@@ -124,7 +134,7 @@ def run(
         backend: of the runtime.
 
     Raises:
-        UsageError: delays in real time.
+        UsageError: delays in real time, or harm that lasts longer than the run.
         NumericalError: more than 0.1 % of steps had no force in time.
         Unavailable: the server does not start.
         DataError, MissingInputError: no such model or trace, or of another plant.
@@ -132,8 +142,9 @@ def run(
     """
     kind = plant_of(settings)
     bundle, path, recorded = opened(settings, model, checkpoint, trace, lockstep=lockstep)
-    memory.check(memory_bytes(kind, bundle, devices, steps), f"{devices} devices, {steps} steps")
     asked = Asked(devices, steps, lockstep, period_ms, gap_steps, delivery, harm, backend)
+    asked.check(kind.step_s)
+    memory.check(memory_bytes(kind, bundle, devices, steps), f"{devices} devices, {steps} steps")
     inputs = {
         "model": describe_input(model, bundle.digest.hex()),
         "checkpoint": describe_input(path, load_checkpoint(path).digest),
@@ -183,6 +194,8 @@ def plan(
 ) -> Plan:
     """Plan a drive; arguments as of :func:`run`."""
     bundle, *_ = opened(settings, model, checkpoint, trace, lockstep=lockstep)
+    asked = Asked(devices, steps, lockstep, period_ms, gap_steps, delivery, harm, backend)
+    asked.check(plant_of(settings).step_s)
     return Plan(
         command="bench-link",
         reads=[f"exported model {model}"],

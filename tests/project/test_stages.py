@@ -88,7 +88,7 @@ MODEL, OTHER = "desktop-h4m2l1", "desktop-reflex"
 BENCH = {
     "model": Path("exported"),
     "devices": 3,
-    "steps": 30,
+    "steps": 1002,
     "lockstep": True,
     "gap_steps": 7,
     "delivery": 0.5,

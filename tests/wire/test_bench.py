@@ -128,6 +128,22 @@ def test_a_trace_and_delays_are_two_links(without_export, tmp_path):
         bench_link.plan(options, checkpoint=MODEL, trace=tmp_path / "trace", lockstep=True)
 
 
+def test_a_run_that_ends_before_its_harm_is_refused(without_export):
+    """Steps of 5 ms: half a second is 100 of them, from the middle on, and one must be left."""
+    given = {"checkpoint": MODEL, "harm": "kill"}
+    with pytest.raises(UsageError, match="from step 100 to 200 of 200") as caught:
+        bench_link.plan(load_settings(), steps=200, **given)
+    assert "--steps 201" in caught.value.hint
+    with pytest.raises(UsageError, match="--harm kill"):
+        bench_link.run(load_settings(), None, steps=200, **given)
+    assert bench_link.plan(load_settings(), steps=201, **given).work
+    for steps, lockstep in ((800, False), (4000, True)):
+        with pytest.raises(UsageError, match="--harm stop"):
+            bench_link.plan(
+                load_settings(), checkpoint=MODEL, harm="stop", steps=steps, lockstep=lockstep
+            )
+
+
 def test_the_wire_is_compared_with_what_was_exported(without_export):
     with pytest.raises(
         DataError, match=r"gym-h4m2l1.* is not what exported was exported"
