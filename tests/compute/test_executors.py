@@ -337,7 +337,7 @@ def test_a_scheduler_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
     distributed: Any = pytest.importorskip("distributed")
 
     class Client(Told):
-        def __init__(self, **_: Any) -> None:
+        def __init__(self, *_: Any, **__: Any) -> None:
             super().__init__({"tcp://a:1": executors.versions(executors.NUMBERS_FROM)})
             self.status = "running"
 
