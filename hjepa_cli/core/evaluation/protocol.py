@@ -147,7 +147,7 @@ class Search:
         self._reference, self._periodic = reference, periodic
         self._acceptable, self._bracket = protocol.acceptable_score, protocol.bracket
         self._step_out = 1 + STEP_OUT * protocol.bracket
-        self._rounds = 0
+        self._rounds, self._asked = 0, list[float]()
         self._steps_down = self._steps_up = 1
         if protocol.curve_devices == protocol.bracket_devices:  # few devices are many already
             for row, point in enumerate(grid):
@@ -174,8 +174,24 @@ class Search:
 
     def wanted(self) -> list[Point]:
         """Return the next points to measure with many devices; none when the search is over."""
+        if self._waits():
+            return []
         self._rounds += 1
-        return [Point(self.kind, gap) for gap in self._next() if gap not in self._measured]
+        self._asked = [gap for gap in self._next() if gap not in self._measured]
+        return [Point(self.kind, gap) for gap in self._asked]
+
+    def _waits(self) -> bool:
+        """Return whether periodic gaps say where to look, and are being searched themselves."""
+        left, right = _bracket(self._scores(), self._acceptable)
+        wide = left is not None and right is not None and right / left > WIDE
+        return wide and self._periodic is not None and self._periodic.is_bracketing
+
+    @property
+    def is_bracketing(self) -> bool:
+        """Return whether it has asked for points to find the crossing, not its interval."""
+        left, right = _bracket(self._scores(), self._acceptable)
+        found = left is None or right is None or right / left - 1 <= self._bracket
+        return bool(self._asked) and not found
 
     def result(self) -> Tolerance:
         """Return the crossing and its interval from the points with many devices.

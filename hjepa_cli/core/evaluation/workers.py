@@ -10,6 +10,7 @@ import functools
 import itertools
 import multiprocessing
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from contextlib import closing, contextmanager
@@ -82,6 +83,7 @@ class Unit(Protocol):
 
 Make = Callable[[Settings, Model | None], Any]
 """Makes a simulator: a class of a module, which other processes find by its name."""
+_Call = tuple["Future[Any]", Make, Settings, ModelFile | None, Unit]
 
 
 class Workers:
@@ -101,7 +103,9 @@ class Workers:
         self.count = count
         self._finished = self._reported = 0
         self._executor, self._counter = executor, counter or (lambda: self._finished)
-        self._lock, self._closed = threading.Lock(), False
+        self._lock, self._closed = threading.RLock(), False
+        self._urgent, self._waiting = deque[_Call](), deque[_Call]()
+        self._busy, self._thread = 0, threading.local()
 
     def submit(
         self,
@@ -111,16 +115,15 @@ class Workers:
         unit: Unit,
         tick: Tick = silent,
     ) -> "Future[Any]":
-        """Start a unit; :meth:`results` waits for it.
-
-        Raises:
-            NumericalError: a worker has died before.
-        """
-        with self._lock, broken_pool_reported():
+        """Start a unit; :meth:`results` waits for it."""
+        future = Future[Any]()
+        future.add_done_callback(self._count)
+        with self._lock:
             if self._closed:
                 raise CancelledError
-            future = self._executor.submit(compute, make, settings, model, unit)
-        future.add_done_callback(self._count)
+            queue = self._urgent if getattr(self._thread, "urgent", False) else self._waiting
+            queue.append((future, make, settings, model, unit))
+            self._hand_out()
         return future
 
     def results(self, futures: Sequence["Future[Any]"], tick: Tick = silent) -> list[Any]:
@@ -154,16 +157,20 @@ class Workers:
     def each(
         self, drive: Callable[[J], R], jobs: Iterable[J]
     ) -> Generator[tuple[J, R], None, None]:
-        """Drive about twice as many jobs at a time as there are workers, each in its own thread.
+        """Drive about four times as many jobs at a time as there are workers, a thread for each.
 
         A job is a search that asks for units step by step: while one waits for the only one that it
-        can ask for, the units of others are computed. Yields jobs and their results as they are
-        ready. The first error ends it; of what is ready by then nothing is lost.
+        can ask for, the units of others are computed. Those of the first job come before all
+        others: it is to be the longest, for which all would wait at the end. Yields jobs and their
+        results as they are ready. The first error ends it; of what is ready by then nothing is
+        lost.
         """
         left, flying = iter(jobs), dict[Future[R], J]()
+        urgent = True
         while True:
-            for job in itertools.islice(left, max(2 * self.count + 1 - len(flying), 0)):
-                flying[_in_thread(drive, job)] = job
+            for job in itertools.islice(left, max(4 * self.count + 1 - len(flying), 0)):
+                flying[_in_thread(functools.partial(self._drive, drive, urgent), job)] = job
+                urgent = False
             if not flying:
                 return
             done, _ = wait(flying, return_when=FIRST_COMPLETED)
@@ -175,6 +182,36 @@ class Workers:
         """Let no thread start anything more, nor show progress."""
         with self._lock:
             self._closed = True
+
+    def _drive(self, drive: Callable[[J], R], urgent: bool, job: J) -> R:
+        """Drive a job in its thread, which says of its units whether they are urgent."""
+        self._thread.urgent = urgent
+        return drive(job)
+
+    def _hand_out(self) -> None:
+        """Give the executor as many units as there are workers, and one to go on with at once."""
+        while self._busy <= self.count and (self._urgent or self._waiting):
+            future, make, settings, model, unit = (self._urgent or self._waiting).popleft()
+            try:
+                running = self._executor.submit(compute, make, settings, model, unit)
+            except Exception as error:
+                future.set_exception(error)
+                continue
+            self._busy += 1
+            running.add_done_callback(functools.partial(self._pass_on, future))
+
+    def _pass_on(self, future: "Future[Any]", running: "Future[Any]") -> None:
+        """Give a unit's outcome to who waits for it, and its worker another unit."""
+        with self._lock:
+            self._busy -= 1
+            if not self._closed:
+                self._hand_out()
+        if running.cancelled():
+            future.cancel()
+        elif error := running.exception():
+            future.set_exception(error)
+        else:
+            future.set_result(running.result())
 
     def _count(self, future: "Future[Any]") -> None:
         if not future.cancelled() and future.exception() is None:
