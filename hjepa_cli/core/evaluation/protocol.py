@@ -1,7 +1,8 @@
 """The protocol measures curves over the gap and over the delivery probability, and tolerances.
 
 A curve is measured on a grid with few devices; where it crosses the acceptable score it is
-measured again with more, until the crossing is bracketed to a few per cent.
+measured again with more, until the crossing is bracketed to a few per cent, random gaps to twice as
+many.
 Both curves live on one axis, the mean gap g between packets in steps: D = g for the gap curve,
 p = 1/g for the delivery curve, whose crossing is interpolated in ln p instead of in D.
 """
@@ -26,6 +27,7 @@ STEP_OUT = 4  # brackets that a search goes outwards at a time, until the interv
 MAX_GUESSES = 4  # rounds of a search that go by guessing, before it bisects
 WIDE = 4.0  # the ends of a bracket so far apart tell little of what lies between them
 CLIFF = 0.05  # that scores fall by over a bracket's width, several times what chance makes
+CHANCE = 2.0  # brackets of random gaps are wider by: scores there differ by chance, too
 SPREAD = 2.7  # D* ÷ the mean gap at p*, about: of random gaps the longest decide
 
 
@@ -145,7 +147,8 @@ class Search:
         self._grid = dict(zip((point.gap for point in grid), scores, strict=True))
         self._measured: dict[float, Outcome] = {}
         self._reference, self._periodic = reference, periodic
-        self._acceptable, self._bracket = protocol.acceptable_score, protocol.bracket
+        self._acceptable = protocol.acceptable_score
+        self._bracket = protocol.bracket * (CHANCE if self._log else 1)
         self._step_out = 1 + STEP_OUT * protocol.bracket
         self._rounds, self._asked = 0, list[float]()
         self._steps_down = self._steps_up = 1
