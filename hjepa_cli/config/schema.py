@@ -385,7 +385,7 @@ class ProtocolSettings:
     gaps: tuple[Count, ...] = (1, 20, 40, 80, 120, 160, 240, 320)
     acceptable_score: Positive = 0.62
     acceptable_lq_ratio: NotNegative = 0.5
-    bracket: Annotated[float, Meta(gt=0, lt=1)] = 0.03
+    bracket: Annotated[float, Meta(gt=0, lt=1)] = 0.03  # around D* at last; around p* twice that
     horizon: Count = 100
     bootstrap: Count = 1000
 

@@ -83,7 +83,7 @@ def test_the_final_bracket_is_narrow_and_measured_with_many(tolerance: float) ->
         gaps = sorted(fake.gaps_with_many(kind))
         left = max(gap for gap in gaps if gap <= tolerance * (1 + 1e-9))
         right = min(gap for gap in gaps if gap >= tolerance * (1 - 1e-9))
-        assert right / left - 1 <= PROTOCOL.bracket
+        assert right / left - 1 <= {"gap": 0.03, "delivery": 0.06}[kind]
         assert len(gaps) <= 9
 
 
@@ -152,8 +152,9 @@ def test_rounds_of_both_searches_are_measured_together() -> None:
 
     Counting(falling(93.7)).curves()
     assert batches[0] == 2 * (len(GRID) - 1)
-    # A fan of three for each kind, then both ends of a narrow bracket around the better guess.
-    assert batches[1:] == [6, 4]
+    # A fan of three for each kind, then both ends of a narrow bracket around the better guess;
+    # that of random gaps may be wider, so that one point more is enough.
+    assert batches[1:] == [6, 3]
 
 
 def test_random_gaps_are_searched_where_periodic_ones_say() -> None:
@@ -270,4 +271,5 @@ def test_at_a_cliff_the_interval_is_as_wide_as_the_search_looks_closely() -> Non
         found = curves.searches[kind].result()
         low, high = found.interval
         assert low <= 93.7 <= high and low <= found.gap <= high
-        assert 1.0 < high / low <= 1 + PROTOCOL.bracket
+        # Scores of random gaps differ by chance as much as 3 % of p changes them.
+        assert 1.0 < high / low <= 1 + {"gap": 0.03, "delivery": 0.06}[kind]
