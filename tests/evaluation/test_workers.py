@@ -1,7 +1,7 @@
 """Units are handed out one by one, those of the first job before all others."""
 
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -55,6 +55,17 @@ def test_a_unit_that_fails_is_raised_where_it_is_waited_for(computed: list[str])
         with pytest.raises(ValueError, match="no"):
             ask(one, "a", "no", "b")
         assert ask(one, "c") == ["C"] and computed == ["a", "no", "b", "c"]
+
+
+def test_units_that_a_lost_cluster_cancels_are_not_waited_for() -> None:
+    class Lost(Executor):
+        def submit(self, *_: Any, **__: Any) -> "Future[Any]":
+            future = Future[Any]()
+            future.cancel()
+            return future
+
+    with pytest.raises(CancelledError):
+        ask(Workers(Lost(), 2), "a", "b", "c", "d")
 
 
 def test_a_pool_that_takes_nothing_more_fails_all_that_wait(computed: list[str]) -> None:

@@ -206,12 +206,10 @@ class Workers:
             self._busy -= 1
             if not self._closed:
                 self._hand_out()
-        if running.cancelled():
-            future.cancel()
-        elif error := running.exception():
-            future.set_exception(error)
-        else:
+        try:
             future.set_result(running.result())
+        except BaseException as error:  # cancelled, too: of a cluster that has gone
+            future.set_exception(error)
 
     def _count(self, future: "Future[Any]") -> None:
         if not future.cancelled() and future.exception() is None:
