@@ -103,9 +103,9 @@ class Workers:
         self.count = count
         self._finished = self._reported = 0
         self._executor, self._counter = executor, counter or (lambda: self._finished)
-        self._lock, self._closed = threading.RLock(), False
+        self._lock, self._closed = threading.Lock(), False
         self._urgent, self._waiting = deque[_Call](), deque[_Call]()
-        self._busy, self._thread = 0, threading.local()
+        self._running, self._thread = list[Future[Any]](), threading.local()
 
     def submit(
         self,
@@ -142,6 +142,7 @@ class Workers:
                 now = self._counter()
                 tick(now - self._reported)
                 self._reported = now
+                self._hand_out()
         with broken_pool_reported():
             return [future.result()[0] for future in futures]
 
@@ -189,27 +190,21 @@ class Workers:
         return drive(job)
 
     def _hand_out(self) -> None:
-        """Give the executor as many units as there are workers, and one to go on with at once."""
-        while self._busy <= self.count and (self._urgent or self._waiting):
+        """Give the executor as many units as there are workers, and one to go on with at once.
+
+        Those who ask for units and wait for them do this, not what is called back when one is
+        done: a pool that breaks calls back while it lets nobody submit.
+        """
+        self._running = [one for one in self._running if not one.done()]
+        while len(self._running) <= self.count and (self._urgent or self._waiting):
             future, make, settings, model, unit = (self._urgent or self._waiting).popleft()
             try:
                 running = self._executor.submit(compute, make, settings, model, unit)
             except Exception as error:
                 future.set_exception(error)
                 continue
-            self._busy += 1
-            running.add_done_callback(functools.partial(self._pass_on, future))
-
-    def _pass_on(self, future: "Future[Any]", running: "Future[Any]") -> None:
-        """Give a unit's outcome to who waits for it, and its worker another unit."""
-        with self._lock:
-            self._busy -= 1
-            if not self._closed:
-                self._hand_out()
-        try:
-            future.set_result(running.result())
-        except BaseException as error:  # cancelled, too: of a cluster that has gone
-            future.set_exception(error)
+            self._running.append(running)
+            running.add_done_callback(functools.partial(_pass_on, future))
 
     def _count(self, future: "Future[Any]") -> None:
         if not future.cancelled() and future.exception() is None:
@@ -283,6 +278,14 @@ def open_workers(unit_steps: int) -> Iterator[Workers]:
                 yield workers
     else:
         yield ThisProcess()
+
+
+def _pass_on(future: "Future[Any]", running: "Future[Any]") -> None:
+    """Give a unit's outcome to who waits for it."""
+    try:
+        future.set_result(running.result())
+    except BaseException as error:  # cancelled, too: of a cluster that has gone
+        future.set_exception(error)
 
 
 def _in_thread(drive: Callable[[J], R], job: J) -> "Future[R]":
