@@ -1,8 +1,8 @@
 """The protocol measures curves over the gap and over the delivery probability, and tolerances.
 
 A curve is measured on a grid with few devices; where it crosses the acceptable score it is
-measured again with more, until the crossing is bracketed to a few per cent, random gaps to twice as
-many.
+measured again with more, until the crossing is bracketed to a few per cent (3 for D*, 6 for p*).
+
 Both curves live on one axis, the mean gap g between packets in steps: D = g for the gap curve,
 p = 1/g for the delivery curve, whose crossing is interpolated in ln p instead of in D.
 """
