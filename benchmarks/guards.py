@@ -556,7 +556,7 @@ GUARDS: dict[str, tuple[Change, ...]] = {
         ("core/plants/stress.py", "if not self.low <= severity <= self.high or", "if False and"),
     ),
     "test_frames_apart.py::test_frames_that_a_device_has_forgotten_are_refused": (
-        ("config/checks.py", "if (back := (encoder.frames - 1) * encoder.frame_gap) > FARTHEST_BACK:", "back = 0\n    if False:"),
+        ("config/checks.py", "if (back := encoder.look[0]) > FARTHEST_BACK:", "back = 0\n    if False:"),
     ),
     "test_sensor.py::test_what_a_camera_cannot_have_is_refused": (
         ("core/plants/sensor.py", "    if exposure_ms > step_ms * (1 + 1e-9):", "    if False:"),

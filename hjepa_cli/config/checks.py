@@ -370,8 +370,8 @@ def _check_encoder(encoder: EncoderSettings) -> None:
             f"--frames {encoder.frames}; method {encoder.method} takes {fitting}",
             key="encoder.frames",
         )
-    if (back := (encoder.frames - 1) * encoder.frame_gap) > FARTHEST_BACK:
-        most = FARTHEST_BACK // (encoder.frames - 1)
+    if (back := encoder.look[0]) > FARTHEST_BACK:
+        most = FARTHEST_BACK * encoder.frame_gap // back
         raise UsageError(
             f"encoder.frame_gap = {encoder.frame_gap} of {encoder.frames} frames is {back} steps "
             f"back; a device remembers {FARTHEST_BACK}: choose 1 to {most}",

@@ -149,6 +149,18 @@ class CollectSettings:
         return self.start or (self.x_m, self.x_dot_m_s, self.theta_rad, self.theta_dot_rad_s)
 
 
+Look = tuple[int, ...]
+"""How many control steps back the frames lie that an encoder sees: the oldest first, 0 last."""
+LOOK: dict[str, Any] = {"frames": 2, "frame_gap": 1, "frame_spacing": "even"}  # unless it is said
+SPACINGS = {"even": 1, "square": 2}  # a power of the number of frames back
+
+
+def look_of(architecture: Mapping[str, Any]) -> Look:
+    """Return the look of an encoder, from what its architecture, or its settings, say of it."""
+    frames, gap, spacing = (architecture.get(name, usual) for name, usual in LOOK.items())
+    return tuple(gap * i ** SPACINGS[spacing] for i in reversed(range(frames)))
+
+
 @dataclasses.dataclass(frozen=True)
 class EncoderSettings:
     """``train-encoder`` trains the JEPA with its P^H, then the probe actor; or a baseline."""
@@ -164,7 +176,9 @@ class EncoderSettings:
         Count,
         Flag("--frames", "Frames of the input: 2 or 4; 2 with --method autoencoder."),
     ] = 4
-    frame_gap: Count = 1  # control steps between them
+    frame_gap: Count = 1  # control steps from the present one to the one before
+    # i · frame_gap or i² · frame_gap steps back: a velocity of one step, and one that noise spares.
+    frame_spacing: Literal["even", "square"] = "square"
     embedding: Width = 256
     hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
@@ -214,6 +228,11 @@ class EncoderSettings:
         """Return the gates of the linear probes, one per state."""
         four = (self.gate_r2_x, self.gate_r2_x_dot, self.gate_r2_theta, self.gate_r2_theta_dot)
         return self.gate_r2 or four
+
+    @property
+    def look(self) -> Look:
+        """Return how many control steps back the frames of the input lie, the oldest first."""
+        return look_of(vars(self))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -420,6 +439,7 @@ UNSAID: dict[str, Any] = {
     "protocol.flagged_in_row": 3,
     "encoder.photometric": "none",
     "encoder.frame_gap": 1,
+    "encoder.frame_spacing": "even",
     "conditions.stress": "",
 }
 # Some of it, and two sections of which nothing is stored either, are on by default, or tuned.

@@ -44,8 +44,7 @@ def train(
 ) -> dict[str, Any]:
     """Train a baseline in place; return its held-out health."""
     device, options = resolve_device(run.settings.device), run.settings.encoder
-    look = {"frames_each": options.frames, "frame_gap": options.frame_gap}
-    _standardise(networks, standardisation_sample(train.frames, **look))
+    _standardise(networks, standardisation_sample(train.frames, options.look))
     watch = functools.partial(_look, networks, test, run.settings)
     trained: tuple[str, ...] = ("encoder", "actor")
     if "decoder" in networks:
@@ -102,8 +101,7 @@ def _read(
 ) -> torch.Tensor:
     """Return what the actor listens to in every ``every``-th step: embeddings [N · K, D]."""
     read, options = functools.partial(read_frames, networks), settings.encoder
-    look = options.frames, options.frame_gap
-    return embed(read, split, settings, every=every, look=look).flatten(0, 1)
+    return embed(read, split, settings, every=every, look=options.look).flatten(0, 1)
 
 
 @torch.inference_mode()
@@ -122,7 +120,7 @@ def _reconstruction_error(
 ) -> float:
     """Return mean squared error ÷ variance of a channel, of evenly spaced frames."""
     options = settings.encoder
-    seen = split.seen(LOOK_EVERY, frames=options.frames, frame_gap=options.frame_gap)
+    seen = split.seen(LOOK_EVERY, options.look)
     device = resolve_device(settings.device)
     objective = Reconstruction(networks, device)
     chosen = seen[:: max(len(seen) // LOOK_FRAMES, 1)]

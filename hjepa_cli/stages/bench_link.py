@@ -393,7 +393,7 @@ def simulated(
     level, another code, and two loops that have little to do with each other.
     """
 
-    back = frames_back(*runtime.bundle.look)
+    back = frames_back(runtime.bundle.look)
 
     def sense(seen: Floats) -> torch.Tensor:
         frames = frames_of(camera, seen[:, back])

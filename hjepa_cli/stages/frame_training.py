@@ -104,8 +104,7 @@ def fit(
         shift_px=options.shift_px,
         mirrored_actions=kind.mirror,
         labels=labels,
-        frames_each=options.frames,
-        frame_gap=options.frame_gap,
+        look=options.look,
     )
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories
     share, device = ranks.share(count), resolve_device(run.settings.device)

@@ -15,6 +15,7 @@ from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.config.schema import (
     RECORDED,
     CameraSettings,
+    Look,
     RecordedSettings,
     Settings,
 )
@@ -44,26 +45,25 @@ def embed(
     settings: Settings,
     *,
     every: int = 1,
-    look: tuple[int, int] | None = None,
+    look: Look | None = None,
     mirrored: bool = False,
     shifts_px: NDArray[np.int64] | None = None,
     advance: Callable[[int], None] = lambda count: None,
 ) -> Tensor:
     """Return frozen embeddings [N, K, D] of k = 0, ``every``, …
 
-    ``look`` says how many frames the encoder sees and how many steps these are apart, unless it
-    says so itself.
+    ``look`` says how many steps back the frames lie, unless the encoder says so itself.
 
     ``mirrored`` takes the frames' mirror images; each trajectory is then moved right by
     ``shifts_px`` [N].
     """
     device = resolve_device(settings.device)
     precision = settings.encoder.precision
-    frames, frame_gap = look or getattr(encoder, "look", (2, 1))
+    look = look or getattr(encoder, "look", (1, 0))
     parts = []
     for start in range(0, len(split.frames), CHUNK):
         part = split[start : start + CHUNK]
-        seen = part.seen(every, frames=frames, frame_gap=frame_gap, mirrored=mirrored)
+        seen = part.seen(every, look, mirrored=mirrored)
         if shifts_px is not None:
             by_trajectory = seen.unflatten(0, (len(part.frames), -1))
             moved = zip(by_trajectory, shifts_px[start : start + CHUNK].tolist(), strict=True)

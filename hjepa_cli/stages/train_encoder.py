@@ -199,11 +199,10 @@ def train_jepa(
     kind = plant_of(settings)
     encoder, companion = modules["encoder"], modules["high"]
     assert isinstance(encoder, Encoder) and isinstance(companion, Predictor)
-    look = {"frames_each": options.frames, "frame_gap": options.frame_gap}
     # Laws and wrong beliefs throw a device about; from what the teacher does, embeddings become
     # smoother in the states, and are as good in all of the others (docs/LOG.md).
     calm = train[driven_by_teacher(settings)]
-    encoder.fit_standardisation(standardisation_sample(calm.frames, **look))
+    encoder.fit_standardisation(standardisation_sample(calm.frames, options.look))
     if ranks.size > 1:
         if options.regulariser != "none":
             raise UsageError(

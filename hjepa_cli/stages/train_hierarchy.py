@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
 from hjepa_cli.config.checks import check_strides
-from hjepa_cli.config.schema import HierarchySettings, Settings
+from hjepa_cli.config.schema import LOOK, HierarchySettings, Settings
 from hjepa_cli.core.control.drivers import methods_of
 from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.networks import health
@@ -177,12 +177,12 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
         labels = torch.cat([labels.flatten(0, 1) for _, labels in seen])
         fit_actor_to(modules, "actor", join(views).z.flatten(0, 1), labels, architecture, settings)
     # Predictors that start from copies of a first picture learn worse.
-    look = {**UNSAID, **architecture}
-    first = remembers_from(look["frames"], look["frame_gap"])
+    assert isinstance(modules["encoder"], Encoder)
+    first = remembers_from(modules["encoder"].look)
     first = max(min(first, views[0].z.shape[1] - 1 - architecture["h"]), 0)  # of short ones
     train_levels(run, modules, architecture, [view.since(first) for view in views], shared)
     if settings.augment.strength and is_soft(source):
-        harden(run, modules, train)
+        harden(run, modules, train, architecture)
     round_weights(modules)
     screen.say("measuring health on all frames")
     examined = examine(modules, train, test, architecture["h"], settings)
@@ -206,12 +206,12 @@ def is_soft(source: Checkpoint) -> bool:
     return metadata["architecture"]["kind"] == "encoder" or "augment" not in metadata["settings"]
 
 
-def harden(run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit) -> None:
+def harden(
+    run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit, architecture: dict[str, Any]
+) -> None:
     """Train the encoder on worse pictures, so that it sees in them what it saw in clean ones."""
-    augment, encoder = run.settings.augment, modules["encoder"]
-    assert isinstance(encoder, Encoder)
-    frames, frame_gap = encoder.look
-    options = dataclasses.replace(run.settings.encoder, frames=frames, frame_gap=frame_gap)
+    augment, its = run.settings.augment, UNSAID | architecture
+    options = dataclasses.replace(run.settings.encoder, **{name: its[name] for name in LOOK})
     fit_on_frames(
         dataclasses.replace(run, settings=dataclasses.replace(run.settings, encoder=options)),
         train,
@@ -221,7 +221,7 @@ def harden(run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit) -> No
         steps=augment.steps,
         learning_rate=augment.learning_rate,
     )
-    encoder.requires_grad_(False)
+    modules["encoder"].requires_grad_(False)
 
 
 def open_encoder(

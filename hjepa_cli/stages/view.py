@@ -297,7 +297,7 @@ def fit_probe(settings: Settings, model: Model, screen: Screen) -> torch.Tensor:
     with screen.progress("fit probe", count, "trajectories") as bar:
         for trajectory in recorded.states:
             now = np.arange(1, len(trajectory), PROBE_EVERY)
-            shown = trajectory[frames_seen(now - 1, *model.look)]
+            shown = trajectory[frames_seen(now - 1, model.look)]
             embeddings.append(model.encode(frames_of(camera, shown)))
             states.append(torch.from_numpy(trajectory[now]))
             bar.advance()

@@ -101,7 +101,7 @@ class Fleet:
         first_number: int = 1,
     ) -> None:
         self.bundle, self._runtime, self._camera = bundle, runtime, camera
-        self._back = frames_back(*bundle.look)
+        self._back = frames_back(bundle.look)
         self._delivered, self._lost, self._first = delivered, lost, first_number
         steps, count = delivered.shape
         self.plants = ScoredPlants(

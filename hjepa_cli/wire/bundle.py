@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from hjepa_cli.config.schema import SPACINGS, Look, look_of
 from hjepa_cli.core.plants.frames import LONGEST
 from hjepa_cli.errors import DataError, MissingInputError, shell
 from hjepa_cli.storage import files
@@ -56,9 +57,9 @@ class Bundle:
         return int(self.manifest["frames"])
 
     @property
-    def look(self) -> tuple[int, int]:
-        """Return κ and the steps between them, where there are more than one."""
-        return self.frames, int(self.manifest.get("frame_gap", 1))
+    def look(self) -> Look:
+        """Return how many steps back the κ pictures lie, the oldest first."""
+        return look_of(self.manifest)
 
     @property
     def axes(self) -> int:
@@ -141,7 +142,8 @@ def open_bundle(directory: Path) -> Bundle:
             and all(isinstance(axis, int) and axis > 0 for axis in shape)
             and type(gap := manifest.get("frame_gap", 1)) is int
             and gap > 0
-            and gap * (manifest["frames"] - 1) < LONGEST
+            and manifest.get("frame_spacing", "even") in SPACINGS
+            and bundle.look[0] < LONGEST
             and bundle.force_limit_n > 0
             and bundle.step_s > 0
             and isinstance(manifest["plant"], str)

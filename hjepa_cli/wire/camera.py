@@ -12,8 +12,9 @@ from typing import Protocol
 
 import numpy as np
 
+from hjepa_cli.config.schema import Look
 from hjepa_cli.core.arrays import Pixels
-from hjepa_cli.core.plants.frames import FRAME_SHAPE, HEIGHT_PX, WIDTH_PX
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, HEIGHT_PX, WIDTH_PX, frames_back
 from hjepa_cli.errors import DataError, MissingInputError, Unavailable, UsageError, require
 
 FROZEN = 1000  # equal pictures in a row
@@ -41,12 +42,12 @@ class Watched:
 
     Args:
         camera: to read from.
-        frames, frame_gap: κ, and how many pictures lie from one to the next.
+        look: how many pictures back the κ lie that the encoder sees, the oldest first.
     """
 
-    def __init__(self, camera: Camera, frames: int, frame_gap: int = 1) -> None:
-        self._camera, self._gap = camera, frame_gap
-        self._seen: deque[Pixels] = deque(maxlen=(frames - 1) * frame_gap + 1)
+    def __init__(self, camera: Camera, look: Look) -> None:
+        self._camera, self._back = camera, frames_back(look)
+        self._seen: deque[Pixels] = deque(maxlen=look[0] + 1)
         self._equal = 0
 
     def read(self) -> bool:
@@ -80,7 +81,7 @@ class Watched:
     @property
     def frames(self) -> Pixels:
         """Return the pictures [1, κ, 64, 128, 3], the newest last."""
-        return np.stack([*self._seen][:: self._gap])[None]
+        return np.stack([self._seen[at] for at in self._back])[None]
 
     def close(self) -> None:
         """Give the camera back."""

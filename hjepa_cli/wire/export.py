@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from hjepa_cli import __version__
-from hjepa_cli.config.schema import CollectSettings, Settings
+from hjepa_cli.config.schema import LOOK, CollectSettings, Settings
 from hjepa_cli.core.arrays import Pixels
 from hjepa_cli.core.control.drivers import methods_of, planner_of
 from hjepa_cli.core.control.planners import Hierarchy, OnePredictor
@@ -263,8 +263,8 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
         "method": method,
         "checkpoint": {"name": path.parent.name, "sha256": model.digest},
         "embedding": model.architecture["embedding"],
+        **{name: model.architecture[name] for name in LOOK if name in model.architecture},
         "frames": model.frames,
-        **({"frame_gap": model.look[1]} if model.look[1] > 1 else {}),
         "frame_shape": list(FRAME_SHAPE),
         "camera": model.camera.manifest(),
         "action_shape": list(model.action_shape),
@@ -397,7 +397,7 @@ def pictures(model: Model, split: str, count: int) -> Pixels:
     rows = max(1, min(32, getattr(collect, _SIZES[split])))
     states = generate(settings, split, range(rows)).states.astype(np.float64)
     steps = np.arange(model.frames - 2, states.shape[1] - 1)
-    windows = states[:, frames_seen(steps, *model.look)]
+    windows = states[:, frames_seen(steps, model.look)]
     flat = windows.reshape(-1, *windows.shape[2:])
     chosen = np.random.default_rng(0).permutation(len(flat))[:count]
     return frames_of(model.camera, flat[chosen])

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hjepa_cli.core.arrays import Pixels, array_from
-from hjepa_cli.core.plants.frames import FRAME_SHAPE
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_back
 from hjepa_cli.errors import ArrayError, Unavailable, require
 from hjepa_cli.wire.bundle import Bundle
 from hjepa_cli.wire.runtime import Runtime
@@ -90,8 +90,8 @@ class Client:
 
     def __init__(self, bundle: Bundle, runtime: Runtime) -> None:
         self._bundle, self._runtime = bundle, runtime
-        frames, self._gap = bundle.look
-        self._seen: deque[Pixels] = deque(maxlen=(frames - 1) * self._gap + 1)
+        self._back = frames_back(bundle.look)
+        self._seen: deque[Pixels] = deque(maxlen=bundle.look[0] + 1)
 
     def act(self, observation: Any) -> dict[str, Any]:
         """Return ``{"actions": float32 [16, m]}`` in newton, of this step and the next ones.
@@ -123,7 +123,8 @@ class Client:
             while len(self._seen) < self._seen.maxlen - 1:  # type: ignore[operator]
                 self._seen.append(picture)
             self._seen.append(picture)
-        z, strides = self._runtime.encode(np.stack([*self._seen][:: self._gap])[None]), []
+        seen = np.stack([self._seen[at] for at in self._back])
+        z, strides = self._runtime.encode(seen[None]), []
         for _ in range(-(-CHUNK_STEPS // self._bundle.stride)):
             forces_n, z = self._runtime.plan(z)
             strides.append(forces_n[0])

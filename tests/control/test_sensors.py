@@ -39,10 +39,11 @@ class Filming(Counting):
         return frames.reshape(*states.shape[:2], *frames.shape[1:])
 
 
-def untrained(**encoder: Any) -> Model:
+def untrained(frame_spacing: str = "even", **encoder: Any) -> Model:
     options = load_settings(flags={f"encoder.{key}": value for key, value in encoder.items()})
     architecture = describe_architecture(options) | {"kind": "hierarchy", "embedding": 8}
     architecture |= {"hidden": 8, "actor_hidden": 8, "actor_dropout": 0.0, "h": 4, "m": 2, "l": 1}
+    architecture["frame_spacing"] = frame_spacing
     torch.manual_seed(0)
     modules = build_modules(architecture)
     metadata = {"architecture": architecture, "plant": "desktop", "settings": options.as_dict()}
@@ -58,26 +59,31 @@ def windows(devices: int = 3, steps: int = 8) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("frame_input", ["difference", "pair"])
 @pytest.mark.parametrize("photometric", ["affine", "gain", "none"])
-@pytest.mark.parametrize(("frames", "frame_gap"), [(4, 1), (2, 1), (4, 5)])
+@pytest.mark.parametrize(
+    ("spacing", "frames", "frame_gap"), [("even", 4, 1), ("square", 4, 1), ("even", 2, 5)]
+)
 def test_embeddings_are_those_of_all_pictures_anew(
-    frame_input: str, photometric: str, frames: int, frame_gap: int
+    frame_input: str, photometric: str, spacing: str, frames: int, frame_gap: int
 ) -> None:
     model = untrained(
-        frame_input=frame_input, photometric=photometric, frames=frames, frame_gap=frame_gap
-    )
+        spacing, frame_input=frame_input, photometric=photometric, frames=frames,
+        frame_gap=frame_gap,
+    )  # fmt: skip
     sense, look = embedding_sensor(model), camera_sensor(model)
     for seen in windows():
         assert torch.allclose(sense(seen), model.encode(look(seen)), atol=1e-5)
 
 
-def test_pictures_are_taken_once() -> None:
+@pytest.mark.parametrize(("spacing", "seen_again"), [("even", 4), ("square", 10)])
+def test_pictures_are_taken_once(spacing: str, seen_again: int) -> None:
     camera = Counting()
-    sense = embedding_sensor(untrained(), camera=camera)
+    sense = embedding_sensor(untrained(spacing), camera=camera)
     for seen in windows():
         sense(seen)
-    # The first look is forgotten: who sends now and then never looks at a picture again.
+    # The first look is forgotten: who sends now and then never looks at a picture again. The
+    # second one is at all that is seen again later.
     counts = Counter(camera.taken.values())
-    assert sum(camera.taken.values()) == 3 * (4 + 4 + 6) and counts[1] == 3 * 7
+    assert sum(camera.taken.values()) == 3 * (4 + seen_again + 6) and counts[1] == 3 * 7
 
 
 def test_other_devices_are_looked_at_anew() -> None:

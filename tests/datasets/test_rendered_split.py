@@ -229,7 +229,7 @@ def test_the_closed_loop_encodes_the_same_pairs(
     recorded: Trajectories, split: RenderedSplit
 ) -> None:
     class Spy:
-        camera, device, look = plant("desktop").camera(), "cpu", (2, 1)
+        camera, device, look = plant("desktop").camera(), "cpu", (1, 0)
 
         def encode(self, frames: np.ndarray) -> Tensor:
             self.shown = torch.from_numpy(frames)
@@ -295,7 +295,7 @@ def test_mirror_images_come_with_negated_actions_and_labels() -> None:
 
 
 def test_the_standardisation_sample_crosses_no_trajectory() -> None:
-    sample = standardisation_sample(painted(7, 10).frames, 1000)[:, :, 0, 0].long()
+    sample = standardisation_sample(painted(7, 10).frames, (1, 0), 1000)[:, :, 0, 0].long()
     assert torch.equal(sample[:, 1, 0], sample[:, 0, 0] + 1)
     assert torch.equal(sample[:, 1, 1], sample[:, 0, 1])
     assert len(sample) == 7 * 10

@@ -137,7 +137,7 @@ def test_fresh_frames_are_read_as_well_as_the_card_says(name):
     def see(split):
         made = generate(settings, split)
         k = np.arange(0, made.steps, 4)
-        seen = made.states[:, frames_seen(k, *model.look)]
+        seen = made.states[:, frames_seen(k, model.look)]
         frames = kind.camera().render(seen.reshape(-1, seen.shape[-1]))
         z = model.encode(frames.reshape(-1, model.frames, *frames.shape[1:]))
         labels_n = made.teacher_n[:, k].reshape(-1, *kind.action_shape)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from hjepa_cli.config.schema import Settings
+from hjepa_cli.config.schema import EncoderSettings, Settings, look_of
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.drivers import build_driver, methods_of
 from hjepa_cli.core.networks.decoder import Decoder, read_frames
@@ -76,15 +76,25 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_before_power_on_lie_copies_of_the_first_frame() -> None:
-    assert frames_seen([0, 1, 2, 9], 4).tolist() == [
+    assert frames_seen([0, 1, 2, 9], (3, 2, 1, 0)).tolist() == [
         [0, 0, 0, 1],
         [0, 0, 1, 2],
         [0, 1, 2, 3],
         [7, 8, 9, 10],
     ]
-    assert frames_seen(5, 2).tolist() == [5, 6]
-    assert frames_seen([3, 30], 4, 4).tolist() == [[0, 0, 0, 4], [19, 23, 27, 31]]
-    assert frames_back(4, 5).tolist() == [-16, -11, -6, -1] and LONGEST == 16
+    assert frames_seen(5, (1, 0)).tolist() == [5, 6]
+    assert frames_seen([3, 30], (12, 8, 4, 0)).tolist() == [[0, 0, 0, 4], [19, 23, 27, 31]]
+    assert frames_back((15, 10, 5, 0)).tolist() == [-16, -11, -6, -1] and LONGEST == 16
+
+
+def test_frames_lie_evenly_or_by_squares_back() -> None:
+    assert look_of({"frames": 4}) == (3, 2, 1, 0) and look_of({}) == (1, 0)
+    assert look_of({"frames": 4, "frame_gap": 5}) == (15, 10, 5, 0)
+    assert look_of({"frames": 4, "frame_spacing": "square"}) == (9, 4, 1, 0)
+    assert EncoderSettings().look == (9, 4, 1, 0) and EncoderSettings(frames=2).look == (1, 0)
+
+
+LOOK = (3, 2, 1, 0)
 
 
 def painted(trajectories: int, steps: int) -> torch.Tensor:
@@ -108,7 +118,7 @@ def test_windows_carry_the_frames_and_labels_of_their_steps(frames: int) -> None
         stride=4,
         mirror=True,
         labels=lambda rows, k, shifts_px: labels[rows, k],
-        frames_each=frames,
+        look=tuple(range(frames))[::-1],
     )
     batch = windows.draw(40, np.random.default_rng(0))
     assert batch.frames.shape == (120, frames, 4, 6, 3) and batch.labels is not None
@@ -129,12 +139,12 @@ def test_splits_and_standardisation_look_at_the_same_frames() -> None:
     data = painted(3, 9)
     zeros = torch.zeros(3, 9)
     split = RenderedSplit(data, torch.zeros(3, 9, 4), zeros, zeros)
-    seen = split.seen(1, frames=4).unflatten(0, (3, 9))
+    seen = split.seen(1, LOOK).unflatten(0, (3, 9))
     for k in range(9):
         expected = [max(k + 1 - back, 0) for back in (3, 2, 1, 0)]
         assert seen[1, k, :, 0, 0, 0].tolist() == expected
-    assert torch.equal(split.seen(3, frames=4, mirrored=True), seen[:, ::3].flatten(0, 1).flip(-2))
-    sample = standardisation_sample(data, frames_each=4)
+    assert torch.equal(split.seen(3, LOOK, mirrored=True), seen[:, ::3].flatten(0, 1).flip(-2))
+    sample = standardisation_sample(data, LOOK)
     assert {tuple(part[:, 0, 0, 0].tolist()) for part in sample} == {
         tuple(max(k + 1 - back, 0) for back in (3, 2, 1, 0)) for k in range(9)
     }
@@ -147,7 +157,7 @@ def test_inputs_of_four_frames_are_the_present_and_three_differences() -> None:
     frames = torch.randint(0, 256, (2, 4, 64, 128, 3), dtype=torch.uint8)
     shown = frames.float().permute(0, 1, 4, 2, 3)
     for frame_input in ("difference", "pair"):
-        inputs = Encoder(16, frame_input, True, frames=4).inputs(frames).float()
+        inputs = Encoder(16, frame_input, True, look=LOOK).inputs(frames).float()
         for back in range(4):
             expected = shown[:, 3 - back]
             if back and frame_input == "difference":

@@ -28,7 +28,8 @@ TINY = {
     "actor.epochs": 1, "actor.batch": 40, "hierarchy.rollout_steps": 8,
     "hierarchy.batch_trajectories": 2, "hierarchy.coarse_steps": 2, "hierarchy.flat_steps": 2,
     "hierarchy.medium_steps": 2, "hierarchy.low_steps": 2,
-    "encoder.frames": 4, "encoder.frame_gap": 4, "encoder.photometric": "affine",
+    "encoder.frames": 4, "encoder.frame_gap": 4, "encoder.frame_spacing": "even",
+    "encoder.photometric": "affine",
     "augment.strength": 1.0, "protocol.warmup_steps": 0, "protocol.steps": 30,
     "protocol.curve_devices": 2, "protocol.bracket_devices": 2, "protocol.payload": "float32",
     "protocol.false_alarm": 0.1,
@@ -50,7 +51,7 @@ def test_training_and_devices_see_the_same_frames(trained: Path) -> None:
     """Frames by the dataset's index, and by what a device remembers, give the same embeddings."""
     settings = load_settings(flags=TINY)
     model = Model.load(trained / "model" / "model.safetensors")
-    assert model.look == (4, 4)
+    assert model.look == (12, 8, 4, 0)
     assert {"frames": 4, "frame_gap": 4, "photometric": "affine"}.items() <= (
         model.architecture.items()
     )
@@ -59,7 +60,7 @@ def test_training_and_devices_see_the_same_frames(trained: Path) -> None:
     by_devices = embed_split(model, settings, "train").z
     # They begin where a device has seen four pictures: those of steps −1, 3, 7 and 11.
     torch.testing.assert_close(by_training[:, 11:], by_devices, atol=1e-4, rtol=1e-4)
-    other = split.seen(1, frames=4, frame_gap=4).unflatten(0, (3, 30))
+    other = split.seen(1, model.look).unflatten(0, (3, 30))
     # Of step 20: the frames of steps 8, 12, 16 and 20, which are stored one further on.
     assert torch.equal(other[:, 20], split.frames[:, [9, 13, 17, 21]])
 
@@ -69,7 +70,7 @@ def test_copies_of_a_worse_picture_are_as_bad_as_it_is() -> None:
     frames = torch.arange(7, dtype=torch.uint8).reshape(1, 7, 1, 1, 1).expand(1, 7, 16, 32, 3)
     windows = FrameWindows(
         frames.contiguous(), torch.zeros(1, 6), window_frames=6, stride=1, mirror=False,
-        frames_each=4,
+        look=(3, 2, 1, 0),
     )  # fmt: skip
     batch = windows.draw(1, np.random.default_rng(0))
     noisy = torch.rand(batch.frames.shape, generator=torch.manual_seed(0))
@@ -92,7 +93,9 @@ def test_the_loop_closes(trained: Path) -> None:
 
 
 def test_frames_that_a_device_has_forgotten_are_refused() -> None:
-    for flags, most in (({"encoder.frames": 4, "encoder.frame_gap": 6}, 5),
+    even = {"encoder.frame_spacing": "even"}
+    for flags, most in (({"encoder.frames": 4, "encoder.frame_gap": 6} | even, 5),
+                        ({"encoder.frames": 4, "encoder.frame_gap": 2}, 1),
                         ({"encoder.frames": 2, "encoder.frame_gap": 16}, 15)):  # fmt: skip
         with pytest.raises(UsageError, match=f"choose 1 to {most}"):
             check_settings(load_settings(flags=flags))

@@ -211,7 +211,7 @@ def apart(checkpoint, tmp_path_factory):
     shipped, directory = load_checkpoint(checkpoint), tmp_path_factory.mktemp("apart")
     metadata, modules = files.jsonable(shipped.metadata), load_modules(shipped)
     for told in (metadata["architecture"], metadata["settings"]["encoder"]):
-        told |= {"frame_gap": 3}
+        told |= {"frames": 4, "frame_gap": 1, "frame_spacing": "square"}
     modules["encoder"].input_std[3:] *= 3  # things move three times as far
     save_checkpoint(directory / "model.safetensors", tensors_of(modules), metadata)
     return export(directory / "model.safetensors", directory / "out", None)
@@ -222,14 +222,16 @@ def test_pictures_apart_and_fitted_to_their_background_are_exported(apart, monke
 
     # Networks that were not trained for it lose a little more in 8 bits.
     monkeypatch.setitem(export.LARGEST_INT8, "force_share", 0.05)
-    assert apart.look == (4, 3) and open_bundle(apart.directory).look == (4, 3)
+    assert apart.look == (9, 4, 1, 0) and open_bundle(apart.directory).look == apart.look
     measured = export.check(apart, apart.directory.parent / "model.safetensors")
     assert max(measured["max_error"].values()) <= 1e-5
     manifest = json.loads((apart.directory / MANIFEST).read_text())
-    for gap in (0, 16, 1.0, "3"):  # a device remembers 16 pictures
-        changed = apart.directory.parent / f"changed-{gap}"
+    # A device remembers 16 pictures.
+    told = [{"frame_gap": gap} for gap in (0, 2, 1.0, "3")] + [{"frame_spacing": "odd"}]
+    for number, other in enumerate(told):
+        changed = apart.directory.parent / f"changed-{number}"
         changed.mkdir()
-        (changed / MANIFEST).write_text(json.dumps(manifest | {"frame_gap": gap}))
+        (changed / MANIFEST).write_text(json.dumps(manifest | other))
         with pytest.raises(DataError, match="malformed"):
             open_bundle(changed)
 

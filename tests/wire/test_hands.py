@@ -31,7 +31,7 @@ def picture(value):
 
 
 def test_the_encoder_sees_the_newest_pictures_and_copies_of_the_first():
-    watched = Watched(Pictures(picture(1), picture(2), picture(3)), 2)
+    watched = Watched(Pictures(picture(1), picture(2), picture(3)), (1, 0))
     seen = []
     while watched.read():
         seen.append(watched.frames[0, :, 0, 0, 0].tolist())
@@ -40,7 +40,7 @@ def test_the_encoder_sees_the_newest_pictures_and_copies_of_the_first():
 
 def test_pictures_further_apart_are_picked_from_those_that_are_remembered():
     """Four pictures, three apart: of numbers 1, 2, … those that many back, or the first."""
-    watched = Watched(Pictures(*map(picture, range(1, 21))), 4, 3)
+    watched = Watched(Pictures(*map(picture, range(1, 21))), (9, 6, 3, 0))
     seen = []
     while watched.read():
         seen.append(watched.frames[0, :, 0, 0, 0].tolist())
@@ -58,11 +58,11 @@ def test_pictures_further_apart_are_picked_from_those_that_are_remembered():
 )
 def test_pictures_of_another_size_or_type_are_refused(bad):
     with pytest.raises(DataError, match="the model sees"):
-        Watched(Pictures(bad), 2).read()
+        Watched(Pictures(bad), (1, 0)).read()
 
 
 def test_a_frozen_camera_is_noticed():
-    watched = Watched(Pictures(*[picture(1)] * (cameras.FROZEN + 2)), 2)
+    watched = Watched(Pictures(*[picture(1)] * (cameras.FROZEN + 2)), (1, 0))
     with pytest.raises(Unavailable, match="frozen"):
         while watched.read():
             pass

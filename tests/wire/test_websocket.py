@@ -93,7 +93,7 @@ class Runtime:
 
 
 class Bundle:
-    look, stride, axes, step_s = (2, 1), 3, 1, 0.001
+    look, stride, axes, step_s = (1, 0), 3, 1, 0.001
     plant, digest = "desktop", bytes(32)
     manifest: ClassVar = {"method": "hjepa"}
 
@@ -112,7 +112,7 @@ def test_a_connection_remembers_the_last_pictures():
 
 def test_a_connection_remembers_pictures_that_are_further_apart():
     class Apart(Bundle):
-        look = (3, 2)
+        look = (4, 2, 0)
 
     runtime = Runtime()
     client = Client(Apart, runtime)

@@ -14,7 +14,7 @@ from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.arrays import Floats
 from hjepa_cli.core.control.sensors import embedding_sensor
 from hjepa_cli.core.datasets.trajectories import generate
-from hjepa_cli.core.plants.frames import LONGEST, frames_seen, remembers_from
+from hjepa_cli.core.plants.frames import EVERY, frames_seen, remembers_from
 
 if TYPE_CHECKING:
     from hjepa_cli.core.networks.model import Model
@@ -41,9 +41,9 @@ class EmbeddedSplit:
 @functools.lru_cache(maxsize=2)  # the splits of one model
 def embed_split(model: "Model", settings: Settings, split: str) -> EmbeddedSplit:
     """Embed a split (``train`` or ``test``) of the settings, from where devices remember enough."""
-    drawn, kind, first = generate(settings, split), model.plant, remembers_from(*model.look)
+    drawn, kind, first = generate(settings, split), model.plant, remembers_from(model.look)
     count, steps = drawn.applied_n[:, first:].shape[:2]
-    seen = frames_seen(first + np.arange(steps), LONGEST)
+    seen = frames_seen(first + np.arange(steps), EVERY)
     z = embed_states(model, drawn.states[:, seen].reshape(count * steps, *seen.shape[1:], -1))
     actions = drawn.applied_n[:, first:].reshape(count, steps, -1).astype(np.float64)
     return EmbeddedSplit(
@@ -55,8 +55,8 @@ def embed_split(model: "Model", settings: Settings, split: str) -> EmbeddedSplit
 
 def sampled_embeddings(model: "Model", settings: Settings, split: str) -> Tensor:
     """Embed about :data:`SAMPLED` pictures of a split of the settings, evenly spaced: [n, D]."""
-    states, first = generate(settings, split).states, remembers_from(*model.look)
-    shown = states[:, frames_seen(np.arange(first, states.shape[1] - 1), LONGEST)]
+    states, first = generate(settings, split).states, remembers_from(model.look)
+    shown = states[:, frames_seen(np.arange(first, states.shape[1] - 1), EVERY)]
     shown = shown.reshape(-1, *shown.shape[2:])
     return embed_states(model, shown[:: max(1, len(shown) // SAMPLED)])
 

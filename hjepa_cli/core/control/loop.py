@@ -34,7 +34,7 @@ from hjepa_cli.core.arrays import Bools, Floats, Integers, Pixels
 from hjepa_cli.core.control.bounds import STATE_LIMIT
 from hjepa_cli.core.control.link import REMEMBERED_STEPS, Downlink, InFlight, lead_steps
 from hjepa_cli.core.plants.cost import COST_CAP
-from hjepa_cli.core.plants.frames import LONGEST, frames_seen
+from hjepa_cli.core.plants.frames import EVERY, LONGEST, frames_seen
 from hjepa_cli.core.plants.system import System
 from hjepa_cli.errors import NumericalError, UsageError
 
@@ -546,4 +546,4 @@ def last_states(rollouts: Floats | Pixels, k: int) -> Any:
 
     Of recordings that is frames, [R, steps + 1, H, W, C].
     """
-    return rollouts[:, frames_seen(k, LONGEST)]
+    return rollouts[:, frames_seen(k, EVERY)]

@@ -34,7 +34,7 @@ def camera_sensor(
     κ are as many as the model's network sees, taken by the camera that the model was trained with
     if none is given. What was recorded comes as frames uint8 [m, 16, H, W, C] in place of states.
     """
-    camera, back = camera or model.camera, frames_back(*model.look)
+    camera, back = camera or model.camera, frames_back(model.look)
 
     def look(seen: Floats | Pixels) -> Pixels:
         last = seen[:, back]
@@ -82,23 +82,23 @@ class Eyes:
 
     def __init__(self, model: "Model", camera: Camera | None = None) -> None:
         self._model, self._camera = model, camera or model.camera
-        self._look, self._back = camera_sensor(model, camera), frames_back(*model.look)
+        self._look, self._longest = camera_sensor(model, camera), model.look[0] + 1
         self._films = hasattr(self._camera, "film")
         self._states: Floats | Pixels = np.zeros((0, 0, 0))
         self._gaze: Gaze | None = None
 
     def encode(self, seen: Floats | Pixels) -> Tensor:
         """Return the embeddings [m, D] of the last states [m, 16, S] or frames."""
-        states = seen[:, self._back]
-        if is_pixels(states) or self._films:
+        if is_pixels(seen) or self._films:
             return self._model.encode(self._look(seen))
+        states = seen[:, -self._longest :]
         again = np.array_equal(states[:, :-1], self._states[:, 1:])
         self._states = states
         if not again or "decoder" in self._model.networks:
             self._gaze = None
             return self._model.encode(self._look(seen))
         if self._gaze is None:
-            self._gaze = self._model.gaze(self._look(seen))
+            self._gaze = self._model.gaze(frames_of(self._camera, states, SENSOR_BATCH))
         else:
             self._gaze.go_on(frames_of(self._camera, states[:, -1:], SENSOR_BATCH))
         return self._gaze.embeddings()

@@ -101,7 +101,7 @@ def steps_within(nmae: Floats | list[float], most: float) -> int:
 @torch.inference_mode()
 def embedded(model: Model, frames: Pixels, camera: Camera) -> Tensor:
     """Embed all steps of windows [N, K + 1, H, W, C], under a camera's conditions: [N, K, D]."""
-    seen = frames_seen(np.arange(frames.shape[1] - 1), *model.look)
+    seen = frames_seen(np.arange(frames.shape[1] - 1), model.look)
     return torch.stack([model.encode(retaken(camera, window[seen])) for window in frames])
 
 

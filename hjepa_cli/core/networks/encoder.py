@@ -9,6 +9,7 @@ channels-last memory, the layout the convolutions are fastest in.
 
 import copy
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Self
 
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils import fuse_conv_bn_eval
 
+from hjepa_cli.config.schema import Look
 from hjepa_cli.core.networks.photometry import against_background
 from hjepa_cli.core.networks.symmetry import (
     MirrorCentre,
@@ -101,7 +103,7 @@ class Encoder(nn.Module):
             their length bends them little there and states stay linearly readable (docs/LOG.md).
         symmetric: whether the embedding of a mirrored picture is the reflected embedding; D is
             even then, and the offset is on the even half.
-        frames, frame_gap: κ, the current one and κ − 1 earlier ones, and the steps between them.
+        look: how many control steps back the κ frames lie, the oldest first, the present one last.
         frame_shape: (H, W, C).
         photometric: whether every frame is fitted to its background first, and by what; see
             :func:`~hjepa_cli.core.networks.photometry.against_background`.
@@ -117,16 +119,15 @@ class Encoder(nn.Module):
         frame_input: str,
         centre: bool,
         symmetric: bool = False,
-        frames: int = 2,
+        look: Look = (1, 0),
         frame_shape: tuple[int, int, int] = FRAME_SHAPE,
         photometric: str = "none",
-        frame_gap: int = 1,
     ) -> None:
         super().__init__()
         self.embedding, self.frame_input, self.symmetric = embedding, frame_input, symmetric
-        self.photometric, self.look = photometric, (frames, frame_gap)
+        self.photometric, self.look = photometric, look
         *size, colours = frame_shape
-        channels, rows_columns = frames * colours, map_of(*size)
+        channels, rows_columns = len(look) * colours, map_of(*size)
         pixels = STEM_PX * 2 ** stages_of(*size)
         self.border_px = tuple(pixels * n - px for n, px in zip(rows_columns, size, strict=True))
         widths = [min(STEM_CHANNELS * 2**i, WIDEST) for i in range(stages_of(*size))]
@@ -220,60 +221,57 @@ class Encoder(nn.Module):
         are fitted to their background are float32, and rounded where networks compute in bfloat16,
         but their differences before that.
         """
-        parts = [self._inputs(part) for part in torch.split(frames, _few(frames))]
+        few = _few(frames, math.prod(frames.shape[1:]))
+        parts = [torch.cat(self._parts(self.fitted(part)), -1) for part in torch.split(frames, few)]
         # [N, H, W, C] memory seen as [N, C, H, W]: channels-last for free.
         return torch.cat(parts).permute(0, 3, 1, 2)
 
-    def next_inputs(self, x: Tensor, last: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what :meth:`inputs` does of packets a step later, sooner: one picture is new.
+    def inputs_of(self, pictures: Sequence[Tensor]) -> Tensor:
+        """Return what :meth:`inputs` does, of κ pictures [N, H, W, C] that are fitted already.
 
-        Args:
-            x: what the network saw a step ago [N, Cκ, H, W].
-            last: the pictures that were new then, fitted to their background [N, H, W, C].
-            frames: those that are now, uint8 [N, 1, H, W, C].
-
-        Returns:
-            The inputs, and the new pictures fitted to their background.
+        The present ones come first.
         """
-        colours, x = frames.shape[-1], x.permute(0, 2, 3, 1)
-        seen, now = torch.empty_like(x), torch.empty_like(last)
-        few = (torch.split(part, _few(frames)) for part in (x, last, frames, seen, now))
-        for before, earlier, new, into, fitted in zip(*few, strict=True):
-            fitted.copy_(self.fitted(new)[0])
-            fresh, kept = [fitted], before[..., :-colours]
-            if self.frame_input == "difference":
-                fresh, kept = [fitted, fitted - earlier], before[..., colours:-colours]
-            torch.cat([*(part.to(x.dtype) for part in fresh), kept], dim=-1, out=into)
-        return seen.permute(0, 3, 1, 2), now
-
-    def _inputs(self, frames: Tensor) -> Tensor:
-        """Return the inputs of a few frames, [N, H, W, Cκ]."""
-        dtype = torch.bfloat16
-        if self.photometric == "none":
-            seen = [frame.to(dtype) for frame in reversed(frames.unbind(1))]
-        else:
-            if not torch.is_autocast_enabled(frames.device.type):
-                dtype = torch.float32
-            seen = self.fitted(frames)
-        earlier = seen[1:]
-        if self.frame_input == "difference":
-            earlier = [later - before for later, before in pairwise(seen)]
-        together = [part.to(dtype) for part in (seen[0], *earlier)]
-        return torch.cat(together, dim=-1)
+        few = _few(pictures[0], len(pictures) * math.prod(pictures[0].shape[1:]))
+        channels = len(pictures) * pictures[0].shape[-1]
+        x = pictures[0].new_empty(*pictures[0].shape[:-1], channels, dtype=self._dtype(pictures[0]))
+        split = (torch.split(one, few) for one in (x, *pictures))
+        for into, *part in zip(*split, strict=True):
+            torch.cat(self._parts(part), -1, out=into)
+        return x.permute(0, 3, 1, 2)
 
     def fitted(self, frames: Tensor) -> list[Tensor]:
-        """Return the κ pictures [N, H, W, C] of frames, fitted to their background, float32."""
+        """Return the κ pictures [N, H, W, C] of frames, fitted to their background, float32.
+
+        The present ones come first.
+        """
         if self.photometric == "none":
             return [frame.float() for frame in reversed(frames.unbind(1))]
         fitted = against_background(frames.flatten(0, 1), self.photometric)
         return [*reversed(fitted.view(frames.shape).unbind(1))]
 
+    def fitted_one(self, frames: Tensor) -> Tensor:
+        """Return the pictures [N, H, W, C] of frames [N, 1, H, W, C], fitted, some at a time."""
+        few = _few(frames, math.prod(frames.shape[1:]))
+        return torch.cat([self.fitted(part)[0] for part in torch.split(frames, few)])
 
-def _few(frames: Tensor) -> int:
-    """Return how many packets of frames [N, κ, H, W, C] to take at a time."""
+    def _parts(self, seen: Sequence[Tensor]) -> list[Tensor]:
+        """Return what the network sees of fitted pictures, each [N, H, W, C]."""
+        earlier = seen[1:]
+        if self.frame_input == "difference":
+            earlier = [later - before for later, before in pairwise(seen)]
+        dtype = self._dtype(seen[0])
+        return [part.to(dtype) for part in (seen[0], *earlier)]
+
+    def _dtype(self, pictures: Tensor) -> torch.dtype:
+        rounded = self.photometric == "none" or torch.is_autocast_enabled(pictures.device.type)
+        return torch.bfloat16 if rounded else torch.float32
+
+
+def _few(frames: Tensor, values: int) -> int:
+    """Return how many packets of so many values to take at a time."""
     few = len(frames)
     if frames.device.type == "cpu":
-        few = max(CACHED_VALUES // math.prod(frames.shape[1:]), 1)
+        few = max(CACHED_VALUES // values, 1)
     return few or 1
 
 

@@ -3,6 +3,7 @@
 import copy
 import functools
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hjepa_cli.compute.device import autocast, compute_dtype, resolve_device
-from hjepa_cli.config.schema import CameraSettings, SensorSettings
+from hjepa_cli.config.schema import LOOK, SPACINGS, CameraSettings, SensorSettings, look_of
 from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.decoder import Decoder, read_frames
 from hjepa_cli.core.networks.encoder import Encoder
@@ -35,17 +36,14 @@ CHOICES = {  # of an architecture; its other values are sizes
     "frame_input": ("difference", "pair"),
     "frames": (2, 4),
     "frame_gap": tuple(range(1, LONGEST)),
+    "frame_spacing": tuple(SPACINGS),
     "stride_actions": ("all", "held"),
     "centre": (True, False),
     "residual": (True, False),
     "mirror": ("exact", "augment", "none"),
     "photometric": FITS,
 }
-UNSAID = {
-    "frames": 2,
-    "frame_gap": 1,
-    "photometric": "none",
-}  # of an encoder, where its architecture has no such
+UNSAID = LOOK | {"photometric": "none"}  # of an encoder, where its architecture has no such
 PRECISIONS = ("auto", "bf16", "fp32")
 LEVELS = {  # of each kind that has some, in the order of the checkpoint
     "encoder": ("high",),
@@ -80,17 +78,15 @@ def build_modules(
         built: nn.ModuleDict = _extended(kind).modules(architecture, action_shape, force_signs)
         return built
     architecture = {**UNSAID, **architecture}
-    embedding, frames = architecture["embedding"], architecture["frames"]
+    embedding, look = architecture["embedding"], look_of(architecture)
     symmetric = architecture["mirror"] == "exact"
     mirror = force_signs if symmetric else None
     frame_shape = camera_in(architecture).frame_shape
 
     def encoder() -> Encoder:
         frame_input, centre = architecture["frame_input"], architecture["centre"]
-        fit, gap = architecture["photometric"], architecture["frame_gap"]
-        return Encoder(
-            embedding, frame_input, centre, symmetric, frames, frame_shape, fit, frame_gap=gap
-        )
+        fit = architecture["photometric"]
+        return Encoder(embedding, frame_input, centre, symmetric, look, frame_shape, fit)
 
     def actor() -> Actor:
         hidden, dropout = architecture["actor_hidden"], architecture["actor_dropout"]
@@ -124,7 +120,7 @@ def build_modules(
             embedding, architecture["hidden"], 0, guided=True, mirror=mirror
         )
     if kind == "autoencoder":
-        modules["decoder"] = Decoder(embedding, frames, symmetric, frame_shape)
+        modules["decoder"] = Decoder(embedding, len(look), symmetric, frame_shape)
         modules["reader"] = encoder()
     if kind != "encoder":
         modules["actor"] = actor()
@@ -288,10 +284,8 @@ class Model:
         self.precision: str = metadata["settings"]["encoder"]["precision"]
         self.plant = kind = plant_in(self.plant_name, metadata["settings"])
         self.force_limit_n, self.action_shape = kind.force_limit_n, kind.action_shape
-        self.frames, frame_gap = (
-            {**UNSAID, **self.architecture}[k] for k in ("frames", "frame_gap")
-        )
-        self.look: tuple[int, int] = (self.frames, frame_gap)
+        self.look = look_of(self.architecture)
+        self.frames = len(self.look)
         self.camera = camera_of(kind, *_seen_by(metadata))
         self.device = resolve_device(device)
         self.networks = for_inference(modules, self.device, self.precision)
@@ -364,33 +358,33 @@ class Model:
 
 
 class Gaze:
-    """Devices are looked at step after step: all pictures but one are those of the step before.
+    """Devices are looked at step after step: all pictures but one are those of the steps before.
 
     Args:
         model: encodes, without a decoder in between.
-        frames: uint8 [N, κ, H, W, C] of the first step.
+        frames: uint8 [N, L, H, W, C] of the first step and of all before it that are seen again.
     """
 
     @torch.inference_mode()
     def __init__(self, model: Model, frames: NDArray[np.uint8]) -> None:
-        self._model = model
-        pictures = torch.from_numpy(frames).to(model.device)
-        with model.autocast():
-            self._x = self._encoder.inputs(pictures)
-            (self._last,) = self._encoder.fitted(pictures[:, -1:])
+        self._model, self._look = model, model.look
+        self._pictures: deque[Tensor] = deque(maxlen=self._look[0] + 1)
+        for step in range(frames.shape[1]):
+            self.go_on(frames[:, step : step + 1])
 
     @torch.inference_mode()
     def go_on(self, frames: NDArray[np.uint8]) -> None:
         """Look at the pictures of the next step, uint8 [N, 1, H, W, C]."""
         pictures = torch.from_numpy(frames).to(self._model.device)
         with self._model.autocast():
-            self._x, self._last = self._encoder.next_inputs(self._x, self._last, pictures)
+            self._pictures.append(self._encoder.fitted_one(pictures))
 
     @torch.inference_mode()
     def embeddings(self) -> Tensor:
         """Return what :meth:`Model.encode` does, but for rounding: float32 [N, D] on the CPU."""
+        seen = [self._pictures[-1 - back] for back in reversed(self._look)]
         with self._model.autocast():
-            return self._encoder.embed(self._x).float().cpu()
+            return self._encoder.embed(self._encoder.inputs_of(seen)).float().cpu()
 
     @property
     def _encoder(self) -> Encoder:

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hjepa_cli.config.checks import FARTHEST_BACK
+from hjepa_cli.config.schema import Look
 from hjepa_cli.core.arrays import Floats, Integers, Pixels, finite
 
 HEIGHT_PX, WIDTH_PX, CHANNELS = 64, 128, 3
 FRAME_SHAPE = (HEIGHT_PX, WIDTH_PX, CHANNELS)
-LONGEST = FARTHEST_BACK + 1  # frames that a device keeps, from which its network sees κ
+EVERY = tuple(range(FARTHEST_BACK, -1, -1))  # what a device remembers, as a network would see it
+LONGEST = len(EVERY)
 
 
 class Camera(Protocol):
@@ -46,26 +48,27 @@ def frame_bits(frame_shape: tuple[int, int, int]) -> int:
     return 8 * math.prod(frame_shape)
 
 
-def frames_seen(k: ArrayLike, frames: int, gap: int = 1) -> Integers:
-    """Return the stored frames that a device looks at in step k: int64 [*K, κ], the oldest first.
+def frames_seen(k: ArrayLike, look: Look) -> Integers:
+    """Return the stored frames that a device looks at in step k [*K]: int64 [*K, κ].
 
-    They are ``gap`` steps apart; the last of the κ is that of step k [*K] itself. Frame 0 is the
-    one before k = 0, where a device is switched on; what would lie before it is a copy of it.
+    Frame 0 is the one before k = 0, where a device is switched on; what would lie before it is a
+    copy of it.
     """
-    return np.maximum(np.asarray(k)[..., None] + 2 + frames_back(frames, gap), 0)
+    back: Integers = np.array(look)
+    return np.maximum(np.asarray(k)[..., None] + 1 - back, 0)
 
 
-def remembers_from(frames: int, gap: int = 1) -> int:
+def remembers_from(look: Look) -> int:
     """Return the first step k in which a device has seen as many frames, and needs no copies.
 
     What is fitted to embeddings begins there: those of copies are of their own kind.
     """
-    return max(gap * (frames - 1) - 1, 0)
+    return max(look[0] - 1, 0)
 
 
-def frames_back(frames: int, gap: int = 1) -> Integers:
+def frames_back(look: Look) -> Integers:
     """Return the indices [κ] of what a network sees among the last frames of a device."""
-    return gap * np.arange(1 - frames, 1) - 1
+    return -1 - np.array(look)
 
 
 def frames_of(camera: Camera, states: ArrayLike, batch: int | None = None) -> Pixels:

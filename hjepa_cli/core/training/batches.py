@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hjepa_cli.config.schema import Look
 from hjepa_cli.core.arrays import Integers
 from hjepa_cli.core.plants.frames import frames_seen
 
@@ -86,8 +87,7 @@ class FrameWindows:
         shift_px: move every window sideways by −shift_px … shift_px whole pixels, the same for all
             its frames: exact physics as well, as long as nothing leaves the picture.
         labels: the teacher in shifted pictures, where that is wanted.
-        frames_each, frame_gap: κ, of which a device remembers no more than it has seen, and how
-            many steps they are apart.
+        look: how many steps back the κ frames lie, of which a device remembers those it has seen.
     """
 
     def __init__(
@@ -101,15 +101,14 @@ class FrameWindows:
         shift_px: int = 0,
         mirrored_actions: float | tuple[float, ...] = -1.0,
         labels: Labels | None = None,
-        frames_each: int = 2,
-        frame_gap: int = 1,
+        look: Look = (1, 0),
     ) -> None:
         self.frames, self.actions = frames, actions
         self.steps = actions.shape[1]
         self.window_frames = frames_that_fit(self.steps, window_frames, stride)
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
         self.mirrored_actions = torch.tensor(mirrored_actions)
-        self.labels, self.frames_each, self.frame_gap = labels, frames_each, frame_gap
+        self.labels, self.look = labels, look
 
     def draw(
         self, count: int, generator: np.random.Generator, share: slice = slice(None)
@@ -125,10 +124,10 @@ class FrameWindows:
         k = torch.from_numpy(steps[share])
         actions = stride_actions(self.actions[trajectories], k, self.stride)
         rows = trajectories[:, None]
-        seen = torch.from_numpy(frames_seen(k.numpy(), self.frames_each, self.frame_gap))
+        seen = torch.from_numpy(frames_seen(k.numpy(), self.look))
         frames = self.frames[rows[..., None], seen]
         copies = (seen == seen[..., :1]).sum(dim=-1, keepdim=True)
-        sources = torch.arange(self.frames_each).maximum(copies - 1)
+        sources = torch.arange(len(self.look)).maximum(copies - 1)
         flipped = torch.zeros(len(k), dtype=torch.bool)
         if self.mirror:
             flipped = torch.from_numpy((generator.random(count) < 0.5)[share])

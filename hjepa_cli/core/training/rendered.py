@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hjepa_cli.config.schema import Look
 from hjepa_cli.core.plants.frames import WIDTH_PX, frames_seen
 from hjepa_cli.core.plants.system import System, Teacher
 from hjepa_cli.core.training.batches import Labels
@@ -28,12 +29,10 @@ class RenderedSplit:
     actions: Tensor
     labels: Tensor
 
-    def seen(
-        self, every: int, *, frames: int = 2, frame_gap: int = 1, mirrored: bool = False
-    ) -> Tensor:
+    def seen(self, every: int, look: Look = (1, 0), *, mirrored: bool = False) -> Tensor:
         """Return what a device looks at in k = 0, ``every``, …: uint8 [N · K, κ, H, W, 3]."""
         steps = np.arange(0, self.frames.shape[1] - 1, every)
-        seen = self.frames[:, torch.from_numpy(frames_seen(steps, frames, frame_gap))]
+        seen = self.frames[:, torch.from_numpy(frames_seen(steps, look))]
         return (seen.flip(-2) if mirrored else seen).flatten(0, 1)
 
     def __getitem__(self, rows: slice) -> "RenderedSplit":
@@ -67,13 +66,11 @@ def labels_of(split: RenderedSplit, kind: System, act: Teacher) -> Labels:
     return labels
 
 
-def standardisation_sample(
-    frames: Tensor, count: int = 512, *, frames_each: int = 2, frame_gap: int = 1
-) -> Tensor:
+def standardisation_sample(frames: Tensor, look: Look, count: int = 512) -> Tensor:
     """Return evenly spaced inputs [≤ ``count``, κ, H, W, 3] of frames [N, T + 1, H, W, 3]."""
     length = frames.shape[1]
     total = len(frames) * length
     current = np.linspace(1, total - 1, min(count, total - 1)).astype(int)
     rows, stored = np.divmod(current[current % length != 0], length)  # 0 has no predecessor
-    seen = torch.from_numpy(frames_seen(stored - 1, frames_each, frame_gap))
+    seen = torch.from_numpy(frames_seen(stored - 1, look))
     return frames[torch.from_numpy(rows)[:, None], seen]
