@@ -144,9 +144,10 @@ class CartPoleEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 class CartPolePixelsEnv(CartPoleEnv):
     """The camera sees the same cart-pole: observations are frames uint8 [64, 128, 3].
 
-    One frame shows no velocity. ``gymnasium.wrappers.FrameStackObservation(env, 4)`` gives the
-    last four, uint8 [4, 64, 128, 3], which is what the encoder of ``desktop-h4m2l1`` takes. Those
-    of ``reset`` are its one frame, as wrappers have no other: a pole at rest to an encoder.
+    One frame shows no velocity. ``gymnasium.wrappers.FrameStackObservation(env, 10)`` gives the
+    last ten; an encoder takes those that ``model.look`` says, how many steps back, the oldest
+    first: ``stack[[-1 - back for back in model.look]]``. Those of ``reset`` are its one frame, as
+    wrappers have no other: a pole at rest to an encoder.
 
     Args:
         **options: those of :class:`CartPoleEnv`.

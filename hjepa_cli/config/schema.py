@@ -176,9 +176,7 @@ class EncoderSettings:
         Count,
         Flag("--frames", "Frames of the input: 2 or 4; 2 with --method autoencoder."),
     ] = 4
-    frame_gap: Count = 1  # control steps from the present one to the one before
-    # i · frame_gap or i² · frame_gap steps back: a velocity of one step, and one that noise spares.
-    frame_spacing: Literal["even", "square"] = "square"
+    frame_gap: Count = 1  # control steps between them
     embedding: Width = 256
     hidden: Width = 1024
     h: Annotated[Count, STRIDE_H] = 4
@@ -242,11 +240,16 @@ class AugmentSettings:
     Baselines on raw frames see them from the beginning; the encoder of a JEPA for some more steps,
     in which it learns to see what it has seen in clean ones. ``strength`` multiplies all from
     ``gain`` on, each the most that a training picture gets; 0 is off.
+
+    From then on its frames lie i² · ``encoder.frame_gap`` steps back instead of i, where that is
+    ``frames_within_s`` at most: a velocity of one step, and others that noise spares. Embeddings
+    that are of such frames from the beginning are harder to predict (docs/LOG.md).
     """
 
     strength: NotNegative = 1.0
     steps: Count = 900
     learning_rate: NotNegative = 7e-4
+    frames_within_s: NotNegative = 0.01  # 0 leaves them where they are
     clean: Annotated[float, Meta(ge=0, le=1)] = 0.4  # share of pictures that stay as they are
     share: Annotated[float, Meta(ge=0, le=1)] = 0.25  # of the others, for each effect by itself
     gain: BelowOne = 0.35  # ± of 1
@@ -439,7 +442,7 @@ UNSAID: dict[str, Any] = {
     "protocol.flagged_in_row": 3,
     "encoder.photometric": "none",
     "encoder.frame_gap": 1,
-    "encoder.frame_spacing": "even",
+    "augment.frames_within_s": 0.0,
     "conditions.stress": "",
 }
 # Some of it, and two sections of which nothing is stored either, are on by default, or tuned.

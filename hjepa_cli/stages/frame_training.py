@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.schema import RECORDED, EncoderSettings, Settings
+from hjepa_cli.config.schema import RECORDED, EncoderSettings, Look, Settings
 from hjepa_cli.core.networks.model import UNSAID
 from hjepa_cli.core.plants.control_law import control_law
 from hjepa_cli.core.plants.named import plant_of
@@ -26,8 +26,9 @@ MOTION_STEPS = 100  # of a simulated trajectory, from its beginning, hold its wi
 
 def recorded(encoder: EncoderSettings, *names: str) -> dict[str, Any]:
     """Return the settings that an architecture records: those named, and others unless usual."""
-    values = {name: getattr(encoder, name) for name in (*names, *UNSAID)}
-    return {name: v for name, v in values.items() if name in names or v != UNSAID[name]}
+    values = UNSAID | vars(encoder)
+    kept = {name: value for name, value in UNSAID.items() if values[name] == value}
+    return {name: values[name] for name in (*names, *UNSAID) if name in names or name not in kept}
 
 
 def steps_shown(settings: Settings, steps: int) -> int:
@@ -62,6 +63,7 @@ def fit(
     look: Callable[[dict[str, float]], dict[str, Any]],
     *,
     augmented: bool = True,
+    looks: tuple[Look, Look] | None = None,
     steps: int | None = None,
     learning_rate: float | None = None,
 ) -> None:
@@ -72,6 +74,7 @@ def fit(
 
     Args:
         augmented: whether networks see the windows as ``[augment]`` makes them.
+        looks: how many steps back the frames lie that networks see, and those of targets.
         steps, learning_rate: others than those of ``[encoder]``.
 
     Raises:
@@ -89,6 +92,7 @@ def fit(
         gradient_clip=options.gradient_clip,
         ranks=ranks,
     )
+    seen, aimed_at = looks or (options.look, options.look)
     longest = steps_shown(run.settings, train.actions.shape[1])
     if options.shift_px:  # refuse a plant whose pictures cannot be moved before any step
         kind.sideways(train.states[:1, 0].numpy().astype(float), options.shift_px)
@@ -104,7 +108,8 @@ def fit(
         shift_px=options.shift_px,
         mirrored_actions=kind.mirror,
         labels=labels,
-        look=options.look,
+        look=seen,
+        target_look=aimed_at,
     )
     stream, count = generator(run.settings.seed, STREAM), options.batch_trajectories
     share, device = ranks.share(count), resolve_device(run.settings.device)

@@ -8,7 +8,6 @@ end it is hardened against worse pictures than it has seen.
 """
 
 import copy
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,10 +19,11 @@ from torch import Tensor, nn
 
 from hjepa_cli.compute.device import resolve_device
 from hjepa_cli.compute.seeding import generator
-from hjepa_cli.config.checks import check_strides
-from hjepa_cli.config.schema import LOOK, HierarchySettings, Settings
+from hjepa_cli.config.checks import FARTHEST_BACK, check_strides
+from hjepa_cli.config.schema import HierarchySettings, Settings, look_of
 from hjepa_cli.core.control.drivers import methods_of
 from hjepa_cli.core.datasets.dataset import Dataset
+from hjepa_cli.core.datasets.trajectories import driven_by_teacher
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.model import LEVELS, UNSAID, levels_of, load_modules
@@ -33,7 +33,7 @@ from hjepa_cli.core.training import levels
 from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.levels import EmbeddedTrajectories
 from hjepa_cli.core.training.optimiser import Optimiser, name_samples
-from hjepa_cli.core.training.rendered import RenderedSplit
+from hjepa_cli.core.training.rendered import RenderedSplit, standardisation_sample
 from hjepa_cli.errors import DataError, MissingInputError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.output.tables import show_hierarchy
@@ -182,7 +182,7 @@ def train_on(source: Checkpoint, run: TrainingRun) -> dict[str, Any]:
     first = max(min(first, views[0].z.shape[1] - 1 - architecture["h"]), 0)  # of short ones
     train_levels(run, modules, architecture, [view.since(first) for view in views], shared)
     if settings.augment.strength and is_soft(source):
-        harden(run, modules, train, architecture)
+        architecture = harden(run, modules, train, architecture)
     round_weights(modules)
     screen.say("measuring health on all frames")
     examined = examine(modules, train, test, architecture["h"], settings)
@@ -208,20 +208,33 @@ def is_soft(source: Checkpoint) -> bool:
 
 def harden(
     run: TrainingRun, modules: nn.ModuleDict, train: RenderedSplit, architecture: dict[str, Any]
-) -> None:
-    """Train the encoder on worse pictures, so that it sees in them what it saw in clean ones."""
-    augment, its = run.settings.augment, UNSAID | architecture
-    options = dataclasses.replace(run.settings.encoder, **{name: its[name] for name in LOOK})
+) -> dict[str, Any]:
+    """Train the encoder on worse pictures, so that it sees in them what it saw in clean ones.
+
+    Returns:
+        The architecture with where its frames lie from then on.
+    """
+    settings, augment, encoder = run.settings, run.settings.augment, modules["encoder"]
+    assert isinstance(encoder, Encoder)
+    hardening, clean_look = Hardening(modules, resolve_device(settings.device)), encoder.look
+    apart = {**architecture, "frame_spacing": "square"}
+    farthest = min(FARTHEST_BACK, augment.frames_within_s / plant_of(settings).step_s)
+    if clean_look[0] < look_of(apart)[0] <= farthest:
+        architecture, look = apart, look_of(apart)
+        calm = train[driven_by_teacher(settings)]
+        hardening.look_elsewhere(look, standardisation_sample(calm.frames, look))
     fit_on_frames(
-        dataclasses.replace(run, settings=dataclasses.replace(run.settings, encoder=options)),
+        run,
         train,
         "hardening",
-        Hardening(modules, resolve_device(run.settings.device)),
+        hardening,
         lambda terms: {"level": "hardening", "loss": terms["hardening"]},
+        looks=(encoder.look, clean_look),
         steps=augment.steps,
         learning_rate=augment.learning_rate,
     )
-    modules["encoder"].requires_grad_(False)
+    encoder.requires_grad_(False)
+    return architecture
 
 
 def open_encoder(

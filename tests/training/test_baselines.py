@@ -91,7 +91,7 @@ def test_frames_lie_evenly_or_by_squares_back() -> None:
     assert look_of({"frames": 4}) == (3, 2, 1, 0) and look_of({}) == (1, 0)
     assert look_of({"frames": 4, "frame_gap": 5}) == (15, 10, 5, 0)
     assert look_of({"frames": 4, "frame_spacing": "square"}) == (9, 4, 1, 0)
-    assert EncoderSettings().look == (9, 4, 1, 0) and EncoderSettings(frames=2).look == (1, 0)
+    assert EncoderSettings().look == (3, 2, 1, 0) and EncoderSettings(frames=2).look == (1, 0)
 
 
 LOOK = (3, 2, 1, 0)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from hjepa_cli.config.checks import check_settings
 from hjepa_cli.config.settings import load_settings
@@ -12,11 +13,13 @@ from hjepa_cli.core.control.embedded_split import embed_split
 from hjepa_cli.core.evaluation.protocol import Point
 from hjepa_cli.core.evaluation.simulator import Block, Simulator
 from hjepa_cli.core.networks.model import Model
-from hjepa_cli.core.training.batches import FrameWindows
+from hjepa_cli.core.training.batches import FrameWindows, TrajectoryBatch
+from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.errors import UsageError
 from hjepa_cli.output.screen import Screen
 from hjepa_cli.stages import collect, train_encoder, train_hierarchy
 from hjepa_cli.stages.inputs import embed, open_dataset, render
+from hjepa_cli.storage.checkpoints import load_checkpoint
 
 QUIET = Screen(quiet=True)
 TINY = {
@@ -28,8 +31,7 @@ TINY = {
     "actor.epochs": 1, "actor.batch": 40, "hierarchy.rollout_steps": 8,
     "hierarchy.batch_trajectories": 2, "hierarchy.coarse_steps": 2, "hierarchy.flat_steps": 2,
     "hierarchy.medium_steps": 2, "hierarchy.low_steps": 2,
-    "encoder.frames": 4, "encoder.frame_gap": 4, "encoder.frame_spacing": "even",
-    "encoder.photometric": "affine",
+    "encoder.frames": 4, "encoder.frame_gap": 4, "encoder.photometric": "affine",
     "augment.strength": 1.0, "protocol.warmup_steps": 0, "protocol.steps": 30,
     "protocol.curve_devices": 2, "protocol.bracket_devices": 2, "protocol.payload": "float32",
     "protocol.false_alarm": 0.1,
@@ -93,9 +95,67 @@ def test_the_loop_closes(trained: Path) -> None:
 
 
 def test_frames_that_a_device_has_forgotten_are_refused() -> None:
-    even = {"encoder.frame_spacing": "even"}
-    for flags, most in (({"encoder.frames": 4, "encoder.frame_gap": 6} | even, 5),
-                        ({"encoder.frames": 4, "encoder.frame_gap": 2}, 1),
+    for flags, most in (({"encoder.frames": 4, "encoder.frame_gap": 6}, 5),
                         ({"encoder.frames": 2, "encoder.frame_gap": 16}, 15)):  # fmt: skip
         with pytest.raises(UsageError, match=f"choose 1 to {most}"):
             check_settings(load_settings(flags=flags))
+
+
+def test_a_hardened_encoder_looks_further_back_than_its_teacher(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Targets are of frames next to each other; what learns sees those 0, 1, 4 and 9 steps back."""
+    settings = load_settings(flags=TINY | {"encoder.frame_gap": 1})
+    batches: list[tuple[Tensor, Tensor]] = []
+    losses = Hardening.losses
+
+    def look(self: Hardening, batch: TrajectoryBatch) -> dict[str, Tensor]:
+        batches.append((batch.frames, batch.aimed_at))
+        assert self.networks["teacher"].look == (3, 2, 1, 0)
+        return losses(self, batch)
+
+    monkeypatch.setattr(Hardening, "losses", look)
+    collect.run(settings, QUIET, out=tmp_path / "data")
+    train_encoder.run(settings, QUIET, dataset=tmp_path / "data", out=tmp_path / "encoder")
+    train_hierarchy.run(
+        settings, QUIET, dataset=tmp_path / "data", encoder=str(tmp_path / "encoder"),
+        out=tmp_path / "model",
+    )  # fmt: skip
+    model = Model.load(tmp_path / "model" / "model.safetensors")
+    assert model.look == (9, 4, 1, 0) and model.architecture["frame_spacing"] == "square"
+    split = render(open_dataset(tmp_path / "data", settings).split("train"), settings, QUIET)
+    by_training = embed(model.networks["encoder"], split, settings)
+    by_devices = embed_split(model, settings, "train").z
+    torch.testing.assert_close(by_training[:, 8:], by_devices, atol=1e-4, rtol=1e-4)
+    for seen, aimed_at in batches:  # the same present, the same step back, and then not
+        assert torch.equal(seen[:, 2:], aimed_at[:, 2:])
+        assert not torch.equal(seen[:, :2], aimed_at[:, :2])
+    # Frames further apart differ by more, and are standardised by that.
+    before, after = (
+        load_checkpoint(tmp_path / of / "model.safetensors").tensors["encoder.input_std"]
+        for of in ("encoder", "model")
+    )
+    more = torch.as_tensor(after / before).view(4, 3).mean(1)
+    assert more[0] == pytest.approx(1, abs=0.05) and (more[2:] > 1.5).all(), more
+
+
+@pytest.mark.parametrize(
+    ("changes", "look"),
+    [
+        ({"augment.frames_within_s": 0.008}, (3, 2, 1, 0)),  # nine steps of 1 ms are longer
+        ({"encoder.frame_gap": 2}, (6, 4, 2, 0)),  # 18 steps back is more than a device remembers
+        ({"encoder.frames": 2}, (1, 0)),  # there is nothing between two
+    ],
+)
+def test_frames_stay_where_they_are(
+    changes: dict[str, object], look: tuple[int, ...], tmp_path: Path
+) -> None:
+    settings = load_settings(flags=TINY | {"encoder.frame_gap": 1} | changes)
+    collect.run(settings, QUIET, out=tmp_path / "data")
+    train_encoder.run(settings, QUIET, dataset=tmp_path / "data", out=tmp_path / "encoder")
+    train_hierarchy.run(
+        settings, QUIET, dataset=tmp_path / "data", encoder=str(tmp_path / "encoder"),
+        out=tmp_path / "model",
+    )  # fmt: skip
+    model = Model.load(tmp_path / "model" / "model.safetensors")
+    assert model.look == look and "frame_spacing" not in model.architecture

@@ -234,7 +234,7 @@ def test_a_jepa_learns_from_what_the_teacher_drives(
     assert all(torch.equal(of, actions[:, :20]) for of in seen["hardening"])
     # Inputs are standardised by the pictures that it learns from.
     frames = torch.from_numpy(Camera("desktop").render(train.states[calm].reshape(-1, 4)))
-    sample = standardisation_sample(frames.unflatten(0, train.states[calm].shape[:2]))
+    sample = standardisation_sample(frames.unflatten(0, train.states[calm].shape[:2]), (1, 0))
     fresh: Any = untrained(train_encoder.describe_architecture(options), options)["encoder"]
     fresh.fit_standardisation(sample)
     saved = load_checkpoint(tmp_path / "encoder" / "model.safetensors")
@@ -303,7 +303,7 @@ def test_four_frames_are_hardened_as_they_were_learned(
     workplace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An encoder brings its own frames along; settings of another one do not matter."""
-    apart = {"encoder__frames": 4, "encoder__frame_gap": 1}
+    apart = {"encoder__frames": 4, "encoder__frame_gap": 2}
     train_encoder.run(settings(**apart), QUIET, dataset=workplace / "data", out=workplace / "apart")
     seen: list[Tensor] = []
     losses = Hardening.losses

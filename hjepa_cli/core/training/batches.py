@@ -22,11 +22,12 @@ class TrajectoryBatch:
     """A batch has B windows of F frames, ``stride`` control steps apart.
 
     Attributes:
-        frames: uint8 [B · F, κ, H, W, 3], the current one last.
+        frames: uint8 [B · F, κ, H, W, 3], the current one last, of what a network sees that learns.
         actions: applied actions ÷ force limit [B, F − 1, stride, *A] between the frames.
         drawn: the windows' names, for messages.
         labels: the teacher's actions there ÷ force limit [B · F, *A], if the windows have any.
-        worse: what a network shall see instead of ``frames``, of which targets are made.
+        worse: what a network shall see instead of ``frames``.
+        targets: frames of which targets are made; ``frames`` unless they lie elsewhere.
         sources: which of its κ pictures each is [B · F, κ]; others than itself where a device has
             been switched on too recently to remember κ, and earlier ones are copies.
     """
@@ -36,7 +37,13 @@ class TrajectoryBatch:
     drawn: str = ""
     labels: Tensor | None = None
     worse: Tensor | None = None
+    targets: Tensor | None = None
     sources: Tensor | None = None
+
+    @property
+    def aimed_at(self) -> Tensor:
+        """Return the frames, as they were taken, of which targets are made."""
+        return self.frames if self.targets is None else self.targets
 
     @property
     def seen(self) -> Tensor:
@@ -88,6 +95,7 @@ class FrameWindows:
             its frames: exact physics as well, as long as nothing leaves the picture.
         labels: the teacher in shifted pictures, where that is wanted.
         look: how many steps back the κ frames lie, of which a device remembers those it has seen.
+        target_look: how many steps back the frames of targets lie, if that is elsewhere.
     """
 
     def __init__(
@@ -102,6 +110,7 @@ class FrameWindows:
         mirrored_actions: float | tuple[float, ...] = -1.0,
         labels: Labels | None = None,
         look: Look = (1, 0),
+        target_look: Look | None = None,
     ) -> None:
         self.frames, self.actions = frames, actions
         self.steps = actions.shape[1]
@@ -109,6 +118,7 @@ class FrameWindows:
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
         self.mirrored_actions = torch.tensor(mirrored_actions)
         self.labels, self.look = labels, look
+        self.target_look = () if target_look in (None, look) else target_look
 
     def draw(
         self, count: int, generator: np.random.Generator, share: slice = slice(None)
@@ -124,10 +134,11 @@ class FrameWindows:
         k = torch.from_numpy(steps[share])
         actions = stride_actions(self.actions[trajectories], k, self.stride)
         rows = trajectories[:, None]
-        seen = torch.from_numpy(frames_seen(k.numpy(), self.look))
+        seen = torch.from_numpy(frames_seen(k.numpy(), (*self.look, *self.target_look)))
         frames = self.frames[rows[..., None], seen]
-        copies = (seen == seen[..., :1]).sum(dim=-1, keepdim=True)
-        sources = torch.arange(len(self.look)).maximum(copies - 1)
+        each = len(self.look)
+        copies = (seen[..., :each] == seen[..., :1]).sum(dim=-1, keepdim=True)
+        sources = torch.arange(each).maximum(copies - 1)
         flipped = torch.zeros(len(k), dtype=torch.bool)
         if self.mirror:
             flipped = torch.from_numpy((generator.random(count) < 0.5)[share])
@@ -144,11 +155,13 @@ class FrameWindows:
             labels = self.labels(rows, k, before[:, None])
             labels[flipped] *= self.mirrored_actions
         windows = (f"{row} from k = {k[0]}" for row, k in zip(chosen, steps, strict=True))
+        frames = frames.flatten(0, 1)
         return TrajectoryBatch(
-            frames.flatten(0, 1),
+            frames[:, :each],
             actions,
             f"windows of trajectories {', '.join(windows)}",
             None if labels is None else labels.flatten(0, 1),
+            targets=frames[:, each:] if self.target_look else None,
             sources=sources.flatten(0, 1),
         )
 
