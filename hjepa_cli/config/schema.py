@@ -247,11 +247,12 @@ class AugmentSettings:
     """
 
     strength: NotNegative = 1.0
-    steps: Count = 900
+    steps: Count = 1500
     learning_rate: NotNegative = 7e-4
     frames_within_s: NotNegative = 0.01  # 0 leaves them where they are
-    clean: Annotated[float, Meta(ge=0, le=1)] = 0.4  # share of pictures that stay as they are
-    share: Annotated[float, Meta(ge=0, le=1)] = 0.25  # of the others, for each effect by itself
+    clean: Annotated[float, Meta(ge=0, le=1)] = 0.3  # share of pictures that stay as they are
+    share: Annotated[float, Meta(ge=0, le=1)] = 0.35  # of the others, for each effect by itself
+    rotation_share: Annotated[float, Meta(ge=0, le=1)] = 0.6  # it is the hardest to see through
     gain: BelowOne = 0.35  # ± of 1
     gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
     colour: BelowOne = 0.1  # ± of each channel
@@ -262,6 +263,7 @@ class AugmentSettings:
     blur_px: NotNegative = 1.75  # standard deviation
     jitter_px: NotNegative = 0.12  # standard deviation, anew in every frame
     rotation_deg: NotNegative = 4.0
+    rectangles: Count = 3  # at most
     rectangle_px: NotNegative = 16.0  # side, of any grey
 
 
@@ -443,6 +445,8 @@ UNSAID: dict[str, Any] = {
     "encoder.photometric": "none",
     "encoder.frame_gap": 1,
     "augment.frames_within_s": 0.0,
+    "augment.rotation_share": 0.25,
+    "augment.rectangles": 1,
     "conditions.stress": "",
 }
 # Some of it, and two sections of which nothing is stored either, are on by default, or tuned.

@@ -16,17 +16,15 @@ from hjepa_cli.core.training.batches import TrajectoryBatch
 from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
 
-OFF = {
-    field.name: 0.0
-    for field in dataclasses.fields(AugmentSettings)
-    if field.name not in ("strength", "steps", "learning_rate", "share")
-}
+KEPT = ("strength", "steps", "learning_rate", "share", "rotation_share", "rectangles")
+OFF = {field.name: 0.0 for field in dataclasses.fields(AugmentSettings) if field.name not in KEPT}
 COUNT = 400
 
 
-def augmented(frames: torch.Tensor, seed: int = 1, **effects: float) -> torch.Tensor:
+def augmented(frames: torch.Tensor, seed: int = 1, **effects: Any) -> torch.Tensor:
     """One window in which every picture has the effects given, and no others."""
-    settings = AugmentSettings(strength=1.0, share=1.0, **{**OFF, **effects})
+    of_all: dict[str, Any] = {"share": 1.0, "rotation_share": 1.0, "rectangles": 1}
+    settings = AugmentSettings(strength=1.0, **{**OFF, **of_all, **effects})
     return Augmentation(settings)(frames, [seed]).float()
 
 
@@ -123,13 +121,13 @@ def test_places_move_as_far_as_they_should() -> None:
 def test_jitter_and_rotation_are_drawn_for_themselves() -> None:
     """Of the pictures that are turned, as many tremble as of the others."""
     effects = OFF | {"rotation_deg": 40.0, "jitter_px": 3.0}
-    settings = AugmentSettings(strength=1.0, share=0.5, **effects)
+    settings = AugmentSettings(strength=1.0, share=0.5, rotation_share=0.7, **effects)
     found = Augmentation(settings)(ramp(), [1])[:, :, 20:45, 50:80].float()
     down = found[..., 0].diff(dim=2).mean((2, 3))  # red falls or grows there where they are turned
     turned = (down.abs() > 0.05).any(1)  # all but those by less than 3 degrees
     trembling = (found[:, 0] != found[:, 1]).flatten(1).any(1)
-    for share in (turned.float().mean() / (37 / 40), trembling.float().mean()):
-        assert abs(share - 0.5) < 4 * 0.5 / COUNT**0.5
+    for found, share in ((turned.float().mean() / (37 / 40), 0.7), (trembling.float().mean(), 0.5)):
+        assert abs(found - share) < 4 * 0.5 / COUNT**0.5
     for group in (turned, ~turned):
         assert abs(trembling[group].float().mean() - 0.5) < 4 * 0.5 / int(group.sum()) ** 0.5
 
@@ -165,6 +163,18 @@ def test_blur_and_rectangles() -> None:
     assert rows.max() <= 12 and rows.max() >= 10 and (rows != columns).any()
     quarters = hidden[:, 0, :, :, 0].any(0).view(2, 32, 2, 64).any(3).any(1)
     assert quarters.all(), "anywhere"
+
+
+def test_as_many_rectangles_as_the_settings_say() -> None:
+    """Each has a place and a grey of its own, and not every one is there."""
+    one, three = (
+        augmented(grey(), rectangle_px=8.0, rectangles=count)[:, 0, :, :, 0] for count in (1, 3)
+    )
+    greys = [[len(torch.unique(picture)) - 1 for picture in of] for of in (one, three)]
+    assert max(greys[0]) == 1 and max(greys[1]) == 3 and 1 in greys[1]
+    covered = [(of != 128).float().mean() for of in (one, three)]
+    # Of sides drawn evenly from 0 to 8 px, rounded; they seldom overlap.
+    assert covered[1] / covered[0] == pytest.approx(3, rel=0.25)
 
 
 class Seen(Encoder):

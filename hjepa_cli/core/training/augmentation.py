@@ -23,7 +23,8 @@ MOST_SEED = 2**62
 BLUR_REACH = 2.5  # standard deviations that a blur is cut off at
 FARTHEST_BLUR_PX = 8.0
 NOISE_INPUTS = 4  # whose noise is drawn for a window
-NUMBERS = 40  # uniform ones that an input takes at most, besides noise and jitter
+NUMBERS = 40  # uniform ones that an input takes at most, besides noise and jitter …
+OF_RECTANGLE = 6  # … and those of the rectangles after the first
 
 
 class Augmentation:
@@ -52,7 +53,8 @@ class Augmentation:
     def _window(self, before: Tensor, after: Tensor, seed: int) -> None:
         """Make inputs [F, κ, H, W, C] worse, one by one: the work stays in the cache."""
         random = torch.Generator().manual_seed(seed)
-        numbers = torch.rand(len(before), NUMBERS, generator=random).tolist()
+        count = NUMBERS + OF_RECTANGLE * (self._of.rectangles - 1)
+        numbers = torch.rand(len(before), count, generator=random).tolist()
         jitter_px = torch.randn(*before.shape[:2], 2, generator=random)
         size = before[0].numel()
         # Each input's noise is cut from one strip at a place of its own: drawing numbers takes most
@@ -67,7 +69,8 @@ class Augmentation:
                 worse.copy_(clean)
                 continue
             pictures = self._moved(clean.float(), moves_px, draws)
-            self._cover(pictures, draws)
+            for _ in range(self._of.rectangles):
+                self._cover(pictures, draws)
             pictures = self._blurred(pictures, draws)
             self._light(pictures, draws)
             start = int(draws.uniform() * (len(strip) - size))
@@ -76,7 +79,8 @@ class Augmentation:
 
     def _moved(self, pictures: Tensor, moves_px: Tensor, draws: "_Draws") -> Tensor:
         """Turn pictures [κ, H, W, C] around their middle, and move each by parts of a pixel."""
-        angle = math.radians(draws.both_ways(self._of.rotation_deg, draws.chosen()))
+        turned = draws.chosen(self._of.rotation_share)
+        angle = math.radians(draws.both_ways(self._of.rotation_deg, turned))
         jitter_px = draws.most(self._of.jitter_px) * draws.chosen()
         if not (angle or jitter_px):
             return pictures
@@ -168,9 +172,9 @@ class _Draws:
         """Return 0 or 1."""
         return int(self.uniform() < 0.5)
 
-    def chosen(self) -> int:
-        """Return 1 if the input has an effect, else 0."""
-        return int(self.uniform() < self._of.share)
+    def chosen(self, share: float | None = None) -> int:
+        """Return 1 if the input has an effect, else 0; as often as all have it, or ``share`` is."""
+        return int(self.uniform() < (self._of.share if share is None else share))
 
     def most(self, at_one: float) -> float:
         """Return the most of an effect, by what it is at a strength of 1."""
