@@ -73,7 +73,7 @@ def run(
     with contextlib.ExitStack() as things:
         part = parse_crop(crop)
         plant = simulated(settings, bundle) if camera == "sim" else None
-        watched = Watched(plant or open_camera(camera, part), bundle.look)
+        watched = Watched(plant or open_camera(camera, part), bundle.look, bundle.most_changed)
         things.enter_context(contextlib.closing(watched))
         hands = actuator or ("sim" if plant else "none")
         if hands == "sim" and not plant:
@@ -112,6 +112,7 @@ def run(
         "model": bundle.digest.hex(),
         "steps": sum(device.counts.values()),
         "sent": drive.sent,
+        "spoilt_pictures": watched.spoilt,
         "forces": device.counts,
         "late_steps": drive.late_steps,
         "ignored": device.ignored,

@@ -62,6 +62,12 @@ class Bundle:
         return look_of(self.manifest)
 
     @property
+    def most_changed(self) -> float | None:
+        """Return the largest share of pixels that a motion changes; bundles of old say none."""
+        share = self.manifest.get("most_changed")
+        return None if share is None else float(share)
+
+    @property
     def axes(self) -> int:
         """Return m, the forces of a step."""
         return math.prod(self.manifest["action_shape"])
@@ -144,6 +150,7 @@ def open_bundle(directory: Path) -> Bundle:
             and gap > 0
             and manifest.get("frame_spacing", "even") in SPACINGS
             and bundle.look[0] < LONGEST
+            and 0 < (bundle.most_changed or 1.0) <= 1
             and bundle.force_limit_n > 0
             and bundle.step_s > 0
             and isinstance(manifest["plant"], str)

@@ -1,8 +1,8 @@
 """A camera gives a device its pictures; three kinds, and a check that every one goes through.
 
 A camera of your own has ``read`` and ``close``. What the encoder has not been trained on it must
-not see: pictures of another size or type are refused, and a picture that never changes is a camera
-that hangs.
+not see: pictures of another size or type are refused, a picture that never changes is a camera that
+hangs, and empty or torn ones are not sent.
 """
 
 from collections import deque
@@ -14,10 +14,12 @@ import numpy as np
 
 from hjepa_cli.config.schema import Look
 from hjepa_cli.core.arrays import Pixels
+from hjepa_cli.core.control.spoilt import changed, empty
 from hjepa_cli.core.plants.frames import FRAME_SHAPE, HEIGHT_PX, WIDTH_PX, frames_back
 from hjepa_cli.errors import DataError, MissingInputError, Unavailable, UsageError, require
 
 FROZEN = 1000  # equal pictures in a row
+MOST_TORN = 3  # … and torn ones
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 
 Crop = tuple[int, int, int, int]
@@ -43,12 +45,21 @@ class Watched:
     Args:
         camera: to read from.
         look: how many pictures back the κ lie that the encoder sees, the oldest first.
+        most_changed: the largest share of pixels that a motion changes between the two newest;
+            ``None`` looks for nothing.
+
+    Attributes:
+        good: whether the newest picture is worth sending. In place of one that is not, the last
+            good one is kept; after :data:`MOST_TORN` torn ones in a row the scene is another one.
+        spoilt: how many were not.
     """
 
-    def __init__(self, camera: Camera, look: Look) -> None:
-        self._camera, self._back = camera, frames_back(look)
+    def __init__(self, camera: Camera, look: Look, most_changed: float | None = None) -> None:
+        self._camera, self._back, self._most = camera, frames_back(look), most_changed
         self._seen: deque[Pixels] = deque(maxlen=look[0] + 1)
-        self._equal = 0
+        self._equal = self._torn = self.spoilt = 0
+        self._begun = False  # with a good one: those before it are forgotten
+        self.good = True
 
     def read(self) -> bool:
         """Take a picture; say whether there was one.
@@ -73,10 +84,25 @@ class Watched:
                 f"the camera is frozen: {FROZEN} equal pictures in a row",
                 hint="look at its cable and its driver, then start the device again",
             )
+        self.good = self._most is None or self._is_good(picture, self._most)
+        self.spoilt += not self.good
+        if self.good and not self._begun:
+            self._seen.clear()
+            self._begun = True
+        elif self._begun and not self.good:
+            picture = self._seen[-1]
         while len(self._seen) < self._seen.maxlen - 1:  # type: ignore[operator]
             self._seen.append(picture)  # of before it was switched on: copies of the first
         self._seen.append(picture)
         return True
+
+    def _is_good(self, picture: Pixels, most: float) -> bool:
+        if empty(picture[None])[0]:
+            return False
+        before = self._seen[self._back[-2] + 1] if self._begun else picture
+        torn = changed(np.stack([before, picture])[None])[0] > most
+        self._torn = self._torn + 1 if torn else 0
+        return not 0 < self._torn <= MOST_TORN
 
     @property
     def frames(self) -> Pixels:

@@ -120,6 +120,10 @@ class Drive:
     def _look(self, k: int) -> bool:
         """Send this step's embedding, if the rule says so or the session is new; say whether."""
         device, rule = self._device, self._rule
+        if not self._camera.good:
+            if self._is_time("pictures"):
+                self._say("the camera gives empty or torn pictures: they are not sent")
+            return False
         new = device.is_new(k)
         if isinstance(rule, OnInnovation):
             if not new and not rule.wants_look(k):

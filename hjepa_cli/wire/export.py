@@ -29,6 +29,7 @@ from hjepa_cli.config.schema import LOOK, CollectSettings, Settings
 from hjepa_cli.core.arrays import Pixels
 from hjepa_cli.core.control.drivers import methods_of, planner_of
 from hjepa_cli.core.control.planners import Hierarchy, OnePredictor
+from hjepa_cli.core.control.spoilt import most_changed
 from hjepa_cli.core.datasets.trajectories import generate
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import hold, plan_stride
@@ -250,11 +251,12 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
     files.make_directory(directory)
     with files.writing(directory):
         (directory / MANIFEST).unlink(missing_ok=True)  # a half-written bundle has none
+    seen = pictures(model, "train", CALIBRATION)
     for name, (network, inputs, outputs) in networks_of(model, method).items():
         data = _onnx(network, inputs, outputs)
         entries[name] = _write(directory, name, data, inputs, outputs)
         if name == "encoder":
-            quantised = _int8(data, pictures(model, "train", CALIBRATION))
+            quantised = _int8(data, seen)
             entries["encoder-int8"] = _write(directory, "encoder-int8", quantised, inputs, outputs)
     manifest = {
         "schema": SCHEMA,
@@ -266,6 +268,7 @@ def export(path: Path, directory: Path, method: str | None) -> Bundle:
         **{name: model.architecture[name] for name in LOOK if name in model.architecture},
         "frames": model.frames,
         "frame_shape": list(FRAME_SHAPE),
+        "most_changed": min(most_changed(seen), 1.0),
         "camera": model.camera.manifest(),
         "action_shape": list(model.action_shape),
         "force_limit_n": model.force_limit_n,

@@ -42,7 +42,7 @@ class Line:
 class Plant:
     """Its camera, its actuator and its encoder."""
 
-    frames = None
+    frames, good = None, True
 
     def read(self):
         return True

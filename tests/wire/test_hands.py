@@ -68,6 +68,23 @@ def test_a_frozen_camera_is_noticed():
             pass
 
 
+def test_spoilt_pictures_are_not_kept_and_a_scene_that_stays_changed_is():
+    """The last good one stands for empty and torn ones, for three torn ones in a row at most."""
+    random = np.random.default_rng(0)
+    scene, other = random.integers(0, 256, (2, *FRAME_SHAPE), dtype=np.uint8)
+    order = [picture(0), scene, picture(255), other, scene, other, other, other, other, other]
+    watched = Watched(Pictures(*order), (1, 0), 0.1)
+    good = []
+    while watched.read():
+        good.append(watched.good)
+        if watched.good:
+            assert np.array_equal(watched.frames[0, -1], order[len(good) - 1])
+        elif len(good) > 2:
+            assert np.array_equal(watched.frames[0, -1], scene)
+    assert good == [False, True, False, False, True, False, False, False, True, True]
+    assert watched.spoilt == 6
+
+
 def test_a_crop_averages_areas():
     random = np.random.default_rng(0)
     wide = random.integers(0, 256, (200, 300, 3), dtype=np.uint8)

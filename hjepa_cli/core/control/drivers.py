@@ -12,19 +12,18 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any
 
-import numpy as np
-
 from hjepa_cli.config.checks import late, split_late
 from hjepa_cli.config.schema import Settings
 from hjepa_cli.core.control.answers import GuardedCoder, GuardedController
 from hjepa_cli.core.control.codecs.codec import Coder
 from hjepa_cli.core.control.controllers import LastForce
 from hjepa_cli.core.control.disagreement import TwoLevels
-from hjepa_cli.core.control.embedded_split import sampled_embeddings
+from hjepa_cli.core.control.embedded_split import sampled_embeddings, sampled_states
 from hjepa_cli.core.control.familiarity import PacketCheck, fit_familiarity
 from hjepa_cli.core.control.link import confirmation_bits
 from hjepa_cli.core.control.loop import Controller, Draws, Sensor
-from hjepa_cli.core.control.sensors import embedding_sensor
+from hjepa_cli.core.control.sensors import camera_sensor, checking_sensor, embedding_sensor
+from hjepa_cli.core.control.spoilt import most_changed
 from hjepa_cli.core.networks.model import Model
 from hjepa_cli.core.networks.planning import Planner
 from hjepa_cli.core.plants.conditions import actual_camera
@@ -157,17 +156,23 @@ def embedding_driver(
     controller: Callable[[int], Controller] | None = None,
     two_levels: Callable[[int], TwoLevels] | None = None,
     family: str = "embedding",
+    *,
+    checks: bool = False,
 ) -> Driver:
     """Build a driver on embeddings, which the model's actor answers where a packet arrives.
 
     Without a ``controller`` for what is in between the last force stays. A ``family`` of its own
-    has no other controller for links that deliver at every step.
+    has no other controller for links that deliver at every step, nor has one that ``checks``
+    packets, whose devices look at their pictures too.
     """
     coder, hold = coder_of(settings, model), last_force(model)
     camera = actual_camera(settings)
     sensor = embedding_sensor(model, coder.send, camera)
+    if checks := checks and settings.protocol.false_alarm > 0:
+        seen = camera_sensor(model)(sampled_states(model, settings, "train"))
+        sensor = checking_sensor(model, coder.send, camera, most_changed(seen))
     drives = controller or hold
-    reactive = hold if family == "embedding" else drives
+    reactive = drives if checks or family != "embedding" else hold
     bits = CODECS[settings.protocol.payload].bits(model.architecture["embedding"])
     return Driver(name, sensor, drives, reactive, bits, family, two_levels=two_levels)
 
@@ -200,10 +205,7 @@ def check_of(settings: Settings, model: Model) -> Callable[[int], PacketCheck] |
     train, test = (
         coder.send(sampled_embeddings(model, settings, split)) for split in ("train", "test")
     )
-    empty = np.zeros((2, model.frames, *camera_in(model.architecture).frame_shape), np.uint8)
-    empty[1] = 255
-    blank = coder.send(model.encode(empty))
-    familiarity = fit_familiarity(train, test, protocol.false_alarm, blank)
+    familiarity = fit_familiarity(train, test, protocol.false_alarm)
     return functools.partial(PacketCheck, familiarity, protocol.flagged_in_row)
 
 

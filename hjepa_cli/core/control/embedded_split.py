@@ -55,10 +55,15 @@ def embed_split(model: "Model", settings: Settings, split: str) -> EmbeddedSplit
 
 def sampled_embeddings(model: "Model", settings: Settings, split: str) -> Tensor:
     """Embed about :data:`SAMPLED` pictures of a split of the settings, evenly spaced: [n, D]."""
+    return embed_states(model, sampled_states(model, settings, split))
+
+
+def sampled_states(model: "Model", settings: Settings, split: str) -> Floats:
+    """Return what devices remember at about :data:`SAMPLED` steps of a split: [n, 16, S]."""
     states, first = generate(settings, split).states, remembers_from(model.look)
     shown = states[:, frames_seen(np.arange(first, states.shape[1] - 1), EVERY)]
     shown = shown.reshape(-1, *shown.shape[2:])
-    return embed_states(model, shown[:: max(1, len(shown) // SAMPLED)])
+    return shown[:: max(1, len(shown) // SAMPLED)]
 
 
 def embed_states(model: "Model", seen: Floats) -> Tensor:

@@ -6,10 +6,8 @@ and Q, how much of it lies beside these. Each may exceed its limit in half of th
 are allowed; the limits are quantiles on held-out pictures. (J. E. Jackson and G. S. Mudholkar,
 Control procedures for residuals associated with principal component analysis, 1979.)
 
-Pictures without anything in them, all black or white, are a third case: an encoder that fits a
-picture to its background sees nothing unusual in them. Their embeddings are known beforehand.
-
-It needs nothing of a device: the controller looks at what it has received.
+What a device itself can see to be garbage it does not embed (:mod:`hjepa_cli.core.control.spoilt`):
+an encoder that fits a picture to its background sees nothing unusual in an empty one.
 """
 
 from __future__ import annotations
@@ -35,14 +33,12 @@ class Familiarity:
         components: orthonormal rows [N, D].
         variances: of the coefficients [N].
         limits: of T² and of Q.
-        blank: embeddings of empty pictures [B, D], and how near to one of them is too near.
     """
 
     mean: Tensor
     components: Tensor
     variances: Tensor
     limits: tuple[float, float]
-    blank: tuple[Tensor, float] | None = None
 
     def statistics(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return T² and Q [n] of embeddings [n, D]."""
@@ -54,20 +50,12 @@ class Familiarity:
     def strange(self, z: Tensor) -> Bools:
         """Return which embeddings [n, D] are unlike those of training: bool [n]."""
         among, beside = self.statistics(z)
-        flagged = (among > self.limits[0]) | (beside > self.limits[1])
-        if self.blank:
-            empty, near = self.blank
-            flagged |= torch.cdist(z.double().cpu(), empty).amin(1) < near
-        return np.asarray((flagged | ~z.isfinite().all(1).cpu()).numpy())
+        familiar = (among <= self.limits[0]) & (beside <= self.limits[1])  # NaN is not
+        return np.asarray((~familiar).numpy())
 
 
-def fit_familiarity(
-    training: Tensor, held_out: Tensor, false_alarm: float, blank: Tensor | None = None
-) -> Familiarity:
-    """Fit to embeddings [n, D], and calibrate on others [m, D] to a share of false alarms.
-
-    Those nearer to one of ``blank`` [B, D] than half of the least distance in training are strange.
-    """
+def fit_familiarity(training: Tensor, held_out: Tensor, false_alarm: float) -> Familiarity:
+    """Fit to embeddings [n, D], and calibrate on others [m, D] to a share of false alarms."""
     z = training.double()
     mean = z.mean(0)
     variances, vectors = torch.linalg.eigh((z - mean).T @ (z - mean) / len(z))
@@ -77,10 +65,6 @@ def fit_familiarity(
     fitted = Familiarity(mean, rows[:count], variances[:count].clamp_min(1e-12), (0.0, 0.0))
     limits = (torch.quantile(of, 1 - false_alarm / 2) for of in fitted.statistics(held_out))
     among, beside = (float(limit) for limit in limits)
-    if blank is not None:
-        empty = blank.double().cpu()
-        near = 0.5 * float(torch.cdist(z, empty).amin())
-        fitted = dataclasses.replace(fitted, blank=(empty, near))
     return dataclasses.replace(fitted, limits=(among, beside))
 
 
@@ -109,8 +93,9 @@ class PacketCheck:
     ) -> tuple[Bools, Tensor | None, Integers | None]:
         """Take what arrives in a step, and return what the controller shall act on.
 
-        A device's first packet is passed on whatever it is, and so is one after ``limit`` flagged
-        ones in a row: then the world has changed, and old predictions are worse.
+        A device's first packet is passed on whatever is in it, and so is one after ``limit``
+        flagged ones in a row: then the world has changed, and old predictions are worse. One that
+        holds nothing, NaN, never is.
         """
         self._k += 1
         self.now[:] = False
@@ -124,12 +109,13 @@ class PacketCheck:
         same = (packets == self._last[at]).all(1).cpu().numpy()
         same &= ~first & (self._k - self._heard_at[rows] >= FROZEN_STEPS)
         flagged = self._familiarity.strange(packets) | same
-        self._last[at], self._heard_at[rows] = packets, self._k
+        full = packets.isfinite().all(1).cpu().numpy()
+        self._last[at], self._heard_at[rows[full]] = packets, self._k
         self._in_row[rows] = np.where(flagged, self._in_row[rows] + 1, 0)
         self.now[rows] = flagged
         self.received[rows] += 1
         self.flagged[rows] += flagged
-        kept = ~flagged | first | (self._in_row[rows] > self._limit)
+        kept = (~flagged | first | (self._in_row[rows] > self._limit)) & full
         passed = np.zeros_like(delivered)
         passed[rows[kept]] = True
         ages = None if ages is None else ages[kept]

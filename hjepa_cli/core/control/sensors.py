@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.core.arrays import Floats, Pixels
+from hjepa_cli.core.control.spoilt import spoilt
 from hjepa_cli.core.plants.frames import Camera, frames_back, frames_of
 
 if TYPE_CHECKING:
@@ -68,6 +69,27 @@ def embedding_sensor(
         for start in range(0, len(seen), SENSOR_BATCH):
             z = eyes.encode(seen[start : start + SENSOR_BATCH])
             received.append(send(z) if send else z)
+        return torch.cat(received).to(model.device)
+
+    return sense
+
+
+def checking_sensor(
+    model: "Model", send: Callable[[Tensor], Tensor], camera: Camera, most: float
+) -> Callable[[Floats | Pixels], Tensor]:
+    """Return an :func:`embedding_sensor` of devices that look at their pictures first.
+
+    Of those that are :func:`~hjepa_cli.core.control.spoilt.spoilt` NaN arrives: that there was a
+    packet, and nothing in it.
+    """
+    look = camera_sensor(model, camera)
+
+    def sense(seen: Floats | Pixels) -> Tensor:
+        received = []
+        for start in range(0, len(seen), SENSOR_BATCH):
+            frames = look(seen[start : start + SENSOR_BATCH])
+            z = send(model.encode(frames))
+            received.append(z.where(~torch.from_numpy(spoilt(frames, most))[:, None], torch.nan))
         return torch.cat(received).to(model.device)
 
     return sense

@@ -56,7 +56,7 @@ def predictor(
 
         second = two_levels if planner is _hierarchy else None
         family = name if fused else "embedding"  # a packet is not all that it plays by
-        return embedding_driver(name, settings, model, drives, second, family)
+        return embedding_driver(name, settings, model, drives, second, family, checks=True)
 
     return Method(name, "embedding", build, planner=planner, **about)
 
@@ -144,7 +144,9 @@ def _linear(settings: Settings, model: Model) -> Driver:
     from hjepa_cli.core.control.linear_latent import LinearPlanner, fit_linear_latent
 
     planner = LinearPlanner(fit_linear_latent(model, settings), model.actor, model.force_limit_n)
-    return embedding_driver("linear", settings, model, _strides(settings, model, planner))
+    return embedding_driver(
+        "linear", settings, model, _strides(settings, model, planner), checks=True
+    )
 
 
 LINEAR = Method(
