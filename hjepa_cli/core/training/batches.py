@@ -118,7 +118,7 @@ class FrameWindows:
         self.stride, self.mirror, self.shift_px = stride, mirror, shift_px
         self.mirrored_actions = torch.tensor(mirrored_actions)
         self.labels, self.look = labels, look
-        self.target_look = () if target_look in (None, look) else target_look
+        self.target_look = look if target_look is None else target_look
 
     def draw(
         self, count: int, generator: np.random.Generator, share: slice = slice(None)
@@ -134,34 +134,38 @@ class FrameWindows:
         k = torch.from_numpy(steps[share])
         actions = stride_actions(self.actions[trajectories], k, self.stride)
         rows = trajectories[:, None]
-        seen = torch.from_numpy(frames_seen(k.numpy(), (*self.look, *self.target_look)))
-        frames = self.frames[rows[..., None], seen]
-        each = len(self.look)
-        copies = (seen[..., :each] == seen[..., :1]).sum(dim=-1, keepdim=True)
-        sources = torch.arange(each).maximum(copies - 1)
-        flipped = torch.zeros(len(k), dtype=torch.bool)
+        flipped, shifts = torch.zeros(len(k), dtype=torch.bool), np.zeros(len(k), dtype=np.int64)
         if self.mirror:
             flipped = torch.from_numpy((generator.random(count) < 0.5)[share])
-            frames[flipped] = frames[flipped].flip(-2)
             actions[flipped] *= self.mirrored_actions
-        shifts = np.zeros(len(k), dtype=np.int64)
         if self.shift_px:
             shifts = generator.integers(-self.shift_px, self.shift_px + 1, size=count)[share]
+
+        def taken(seen: Tensor) -> Tensor:
+            frames = self.frames[rows[..., None], seen]
+            frames[flipped] = frames[flipped].flip(-2)
             for window, shift_px in zip(frames, shifts, strict=True):
-                window.copy_(shift_sideways(window, int(shift_px)))
+                if shift_px:
+                    window.copy_(shift_sideways(window, int(shift_px)))
+            return frames.flatten(0, 1)
+
+        seen, aimed_at = (
+            torch.from_numpy(frames_seen(k.numpy(), look)) for look in (self.look, self.target_look)
+        )
+        copies = (seen == seen[..., :1]).sum(dim=-1, keepdim=True)
+        sources = torch.arange(len(self.look)).maximum(copies - 1)
         labels = None
         if self.labels is not None:  # a mirror image moved right is that of one moved left
             before = np.where(flipped.numpy(), -shifts, shifts)
             labels = self.labels(rows, k, before[:, None])
             labels[flipped] *= self.mirrored_actions
         windows = (f"{row} from k = {k[0]}" for row, k in zip(chosen, steps, strict=True))
-        frames = frames.flatten(0, 1)
         return TrajectoryBatch(
-            frames[:, :each],
+            taken(seen),
             actions,
             f"windows of trajectories {', '.join(windows)}",
             None if labels is None else labels.flatten(0, 1),
-            targets=frames[:, each:] if self.target_look else None,
+            targets=taken(aimed_at) if self.target_look != self.look else None,
             sources=sources.flatten(0, 1),
         )
 
