@@ -35,7 +35,7 @@ from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.hierarchy import hold, plan_stride
 from hjepa_cli.core.networks.model import KINDS, Model, load_modules
 from hjepa_cli.core.plants.control_law import control_of
-from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of, frames_seen
+from hjepa_cli.core.plants.frames import FRAME_SHAPE, frames_of, frames_seen, remembers_from
 from hjepa_cli.core.plants.named import camera_in
 from hjepa_cli.core.plants.recorded import Recorded
 from hjepa_cli.errors import DataError, NumericalError, UsageError, choices, require, shell
@@ -62,7 +62,7 @@ NOT_EXPORTED = ("linear", "hjepa-fused")  # plan with more than the networks of 
 OURS = {MANIFEST, CHECK, *(file for name in NETWORKS for file in files_of(name))}
 Inputs = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Shape of a row and type of each input, by name."""
-LARGEST_INT8 = {"rms_z": 0.015, "force_share": 0.025}  # of the forces' own root mean square
+LARGEST_INT8 = {"rms_z": 0.015, "force_share": 0.035}  # of the forces' own root mean square
 
 
 class _Seen(nn.Module):
@@ -399,7 +399,7 @@ def pictures(model: Model, split: str, count: int) -> Pixels:
     settings = Settings(plant=model.plant_name, collect=collect, control=control)
     rows = max(1, min(32, getattr(collect, _SIZES[split])))
     states = generate(settings, split, range(rows)).states.astype(np.float64)
-    steps = np.arange(model.frames - 2, states.shape[1] - 1)
+    steps = np.arange(remembers_from(model.look), states.shape[1] - 1)
     windows = states[:, frames_seen(steps, model.look)]
     flat = windows.reshape(-1, *windows.shape[2:])
     chosen = np.random.default_rng(0).permutation(len(flat))[:count]

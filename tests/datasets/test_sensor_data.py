@@ -15,6 +15,7 @@ from hjepa_cli.core.control.drivers import build_driver
 from hjepa_cli.core.datasets.dataset import load_dataset
 from hjepa_cli.core.evaluation.curves import Digest
 from hjepa_cli.core.networks.model import Model, load_modules
+from hjepa_cli.core.plants.frames import frames_back
 from hjepa_cli.core.plants.named import camera_of, plant, sensor_in
 from hjepa_cli.core.plants.sensor import Sensed
 from hjepa_cli.errors import DataError, UsageError
@@ -101,7 +102,7 @@ def test_a_model_s_loops_take_pictures_as_it_was_trained(model, monkeypatch):
         assert under_law_of(model, settings).sensor == expected
         build_driver("local", settings, model).sensor(states)
         camera = camera_of(plant("desktop"), settings.camera, expected)
-        shown = states[:, -model.frames :]
+        shown = states[:, frames_back(model.look)]
         wanted = camera.render(shown.reshape(-1, 4)).reshape(5, -1, 64, 128, 3)
         np.testing.assert_array_equal(seen.pop(), wanted)
 

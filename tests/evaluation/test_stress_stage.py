@@ -115,8 +115,7 @@ def test_flagged_packets_are_counted_in_curves_and_rows(tmp_path) -> None:
     small = load_settings("smoke", flags=changes)
     evaluated = evaluate.run(small, quiet, checkpoint="desktop-h4m2l1", out=tmp_path / "curves")
     every, five = evaluated["methods"]["hjepa"]["gap_curve"]
-    assert "flagged" not in every, "with every packet nothing is predicted"
-    assert 0 <= five["flagged"] < 0.2
+    assert 0 <= every["flagged"] < 0.2 and 0 <= five["flagged"] < 0.2
     black = load_settings("smoke", flags=changes | {"stress": ("black=1",)})
     found = evaluate.run(black, quiet, checkpoint="desktop-h4m2l1", out=tmp_path / "stress")
     entry = found["stress"]["methods"]["hjepa"]

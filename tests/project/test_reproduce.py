@@ -74,7 +74,7 @@ def test_times_are_planned_as_they_were_measured():
     planned_s = {part.command: part.seconds for part in reproduce.parts(load_settings())}
     trained_s = sum(planned_s[name] for name in ORDER[:3])
     measured = {
-        "trainings": (trained_s, 11 * 60),
+        "trainings": (trained_s, 14 * 60),
         "train-encoder": (planned_s["train-encoder"], 399),
         "eval": (planned_s["eval"], 9 * 60),
     }

@@ -112,6 +112,9 @@ def test_config_reproduces_the_settings(preset: str) -> None:
 
 
 OFF = {
+    "augment.frames_within_s": 0.0,
+    "augment.rotation_share": 0.25,
+    "augment.rectangles": 1,
     "encoder.photometric": "none",
     "augment.strength": 0.0,
     "control.gains_n": [],
