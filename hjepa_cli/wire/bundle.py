@@ -150,7 +150,7 @@ def open_bundle(directory: Path) -> Bundle:
             and gap > 0
             and manifest.get("frame_spacing", "even") in SPACINGS
             and bundle.look[0] < LONGEST
-            and 0 < (bundle.most_changed or 1.0) <= 1
+            and 0 < manifest.get("most_changed", 1.0) <= 1
             and bundle.force_limit_n > 0
             and bundle.step_s > 0
             and isinstance(manifest["plant"], str)

@@ -18,8 +18,8 @@ from hjepa_cli.core.control.spoilt import changed, empty
 from hjepa_cli.core.plants.frames import FRAME_SHAPE, HEIGHT_PX, WIDTH_PX, frames_back
 from hjepa_cli.errors import DataError, MissingInputError, Unavailable, UsageError, require
 
-FROZEN = 1000  # equal pictures in a row
-MOST_TORN = 3  # … and torn ones
+FROZEN = 1000  # pictures in a row that are equal, empty or torn
+MOST_TORN = 3  # in a row
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 
 Crop = tuple[int, int, int, int]
@@ -57,7 +57,8 @@ class Watched:
     def __init__(self, camera: Camera, look: Look, most_changed: float | None = None) -> None:
         self._camera, self._back, self._most = camera, frames_back(look), most_changed
         self._seen: deque[Pixels] = deque(maxlen=look[0] + 1)
-        self._equal = self._torn = self.spoilt = 0
+        self._newest: Pixels | None = None  # as it came
+        self._useless = self._torn = self.spoilt = 0
         self._begun = False  # with a good one: those before it are forgotten
         self.good = True
 
@@ -66,7 +67,7 @@ class Watched:
 
         Raises:
             DataError: it has another size or type.
-            Unavailable: there is none, or it has been the same for too long.
+            Unavailable: there is none, or it has been the same, or spoilt, for too long.
         """
         picture = self._camera.read()
         if picture is None:
@@ -77,15 +78,17 @@ class Watched:
                 f"the camera gives {shape} of {dtype}; the model sees {FRAME_SHAPE} of uint8, RGB",
                 hint="--crop X,Y,WIDTH,HEIGHT with a part twice as wide as high",
             )
-        same = bool(self._seen) and np.array_equal(picture, self._seen[-1])
-        self._equal = self._equal + 1 if same else 0
-        if self._equal >= FROZEN:
-            raise Unavailable(
-                f"the camera is frozen: {FROZEN} equal pictures in a row",
-                hint="look at its cable and its driver, then start the device again",
-            )
+        same = self._newest is not None and np.array_equal(picture, self._newest)
+        self._newest = picture
         self.good = self._most is None or self._is_good(picture, self._most)
         self.spoilt += not self.good
+        self._useless = self._useless + 1 if same or not self.good else 0
+        if self._useless >= FROZEN:
+            what = "is frozen" if same else "shows nothing"
+            raise Unavailable(
+                f"the camera {what}: {FROZEN} equal, empty or torn pictures in a row",
+                hint="look at its cable and its driver, then start the device again",
+            )
         if self.good and not self._begun:
             self._seen.clear()
             self._begun = True

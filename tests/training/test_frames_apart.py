@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from hjepa_cli.config.checks import check_settings
+from hjepa_cli.config.schema import Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.control.embedded_split import embed_split
 from hjepa_cli.core.evaluation.protocol import Point
@@ -38,14 +39,20 @@ TINY = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root, settings = tmp_path_factory.mktemp("apart"), load_settings(flags=TINY)
+def train(settings: Settings, root: Path) -> Model:
+    """Collect, train and load a model; data, encoder and model lie below ``root``."""
     collect.run(settings, QUIET, out=root / "data")
     train_encoder.run(settings, QUIET, dataset=root / "data", out=root / "encoder")
     train_hierarchy.run(
         settings, QUIET, dataset=root / "data", encoder=str(root / "encoder"), out=root / "model"
     )
+    return Model.load(root / "model" / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("apart")
+    train(load_settings(flags=TINY), root)
     return root
 
 
@@ -115,13 +122,7 @@ def test_a_hardened_encoder_looks_further_back_than_its_teacher(
         return losses(self, batch)
 
     monkeypatch.setattr(Hardening, "losses", look)
-    collect.run(settings, QUIET, out=tmp_path / "data")
-    train_encoder.run(settings, QUIET, dataset=tmp_path / "data", out=tmp_path / "encoder")
-    train_hierarchy.run(
-        settings, QUIET, dataset=tmp_path / "data", encoder=str(tmp_path / "encoder"),
-        out=tmp_path / "model",
-    )  # fmt: skip
-    model = Model.load(tmp_path / "model" / "model.safetensors")
+    model = train(settings, tmp_path)
     assert model.look == (9, 4, 1, 0) and model.architecture["frame_spacing"] == "square"
     split = render(open_dataset(tmp_path / "data", settings).split("train"), settings, QUIET)
     by_training = embed(model.networks["encoder"], split, settings)
@@ -151,11 +152,5 @@ def test_frames_stay_where_they_are(
     changes: dict[str, object], look: tuple[int, ...], tmp_path: Path
 ) -> None:
     settings = load_settings(flags=TINY | {"encoder.frame_gap": 1} | changes)
-    collect.run(settings, QUIET, out=tmp_path / "data")
-    train_encoder.run(settings, QUIET, dataset=tmp_path / "data", out=tmp_path / "encoder")
-    train_hierarchy.run(
-        settings, QUIET, dataset=tmp_path / "data", encoder=str(tmp_path / "encoder"),
-        out=tmp_path / "model",
-    )  # fmt: skip
-    model = Model.load(tmp_path / "model" / "model.safetensors")
+    model = train(settings, tmp_path)
     assert model.look == look and "frame_spacing" not in model.architecture

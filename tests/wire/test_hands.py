@@ -85,6 +85,18 @@ def test_spoilt_pictures_are_not_kept_and_a_scene_that_stays_changed_is():
     assert watched.spoilt == 6
 
 
+@pytest.mark.parametrize("levels", [(0, 0), (0, 1)], ids=["black", "flickering black"])
+def test_a_camera_that_has_gone_black_ends_the_device(levels):
+    """Its last good picture is kept, and predictions on it must not go on for ever."""
+    scene = np.random.default_rng(0).integers(0, 256, FRAME_SHAPE, dtype=np.uint8)
+    black = [picture(levels[number % 2]) for number in range(cameras.FROZEN + 2)]
+    watched = Watched(Pictures(scene, *black), (1, 0), 0.1)
+    with pytest.raises(Unavailable, match=r"frozen|shows nothing"):
+        while watched.read():
+            pass
+    assert cameras.FROZEN - 1 <= watched.spoilt <= cameras.FROZEN
+
+
 def test_a_crop_averages_areas():
     random = np.random.default_rng(0)
     wide = random.integers(0, 256, (200, 300, 3), dtype=np.uint8)
