@@ -118,3 +118,18 @@ def test_steps_beyond_those_of_a_session_begin_another_one(line, monkeypatch):
     drive.run(90, None)
     assert line.steps == [0, 10, 20, 30, 1, 10, 20, 30, 1]
     assert line.controller.counts["sessions"] == 3 and device.counts["planned"] > 80
+
+
+def test_spoilt_pictures_are_not_sent(line):
+    lines = []
+    _, drive = drive_of(line, lines, actor=local_n)
+    drive.connect()
+    Plant.good = False
+    try:
+        drive.run(30, None)
+    finally:
+        Plant.good = True
+    assert line.steps == [] and drive.sent == 0
+    assert any("empty or torn" in text for text in lines)
+    drive.run(30, None)
+    assert line.steps and drive.sent == len(line.steps)
