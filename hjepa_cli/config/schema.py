@@ -250,6 +250,8 @@ class AugmentSettings:
     steps: Count = 1500
     learning_rate: NotNegative = 7e-4
     frames_within_s: NotNegative = 0.01  # 0 leaves them where they are
+    force_weight: NotNegative = 0.1  # of planned forces' squared error beside 1 − cos
+    force_steps: Count = 60  # that are planned from a picture
     clean: Annotated[float, Meta(ge=0, le=1)] = 0.3  # share of pictures that stay as they are
     share: Annotated[float, Meta(ge=0, le=1)] = 0.35  # of the others, for each effect by itself
     rotation_share: Annotated[float, Meta(ge=0, le=1)] = 0.6  # it is the hardest to see through
@@ -290,7 +292,8 @@ class HierarchySettings:
     l: Annotated[Count, Flag("--l", "Stride of the low level.")] = 1
     # Of the pictures, sideways by up to encoder.shift_px, for actor and levels.
     shifted_copies: CountOrNone = 2
-    rollout_steps: Count = 160  # as long as the gaps that models are to bear, and packets are late
+    # In longer ones forces tell what pictures did not, and levels follow their own actor's later.
+    rollout_steps: Count = 80
     batch_trajectories: Count = 16
     coarse_starts: Count = 8
     flat_starts: Count = 2
@@ -445,6 +448,8 @@ UNSAID: dict[str, Any] = {
     "encoder.photometric": "none",
     "encoder.frame_gap": 1,
     "augment.frames_within_s": 0.0,
+    "augment.force_weight": 0.0,
+    "augment.force_steps": 60,
     "augment.rotation_share": 0.25,
     "augment.rectangles": 1,
     "conditions.stress": "",

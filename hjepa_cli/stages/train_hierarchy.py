@@ -216,7 +216,8 @@ def harden(
     """
     settings, augment, encoder = run.settings, run.settings.augment, modules["encoder"]
     assert isinstance(encoder, Encoder)
-    hardening, clean_look = Hardening(modules, resolve_device(settings.device)), encoder.look
+    device, clean_look = resolve_device(settings.device), encoder.look
+    hardening = Hardening(modules, device, augment, architecture["h"])
     apart = {**architecture, "frame_spacing": "square"}
     farthest = min(FARTHEST_BACK, augment.frames_within_s / plant_of(settings).step_s)
     if clean_look[0] < look_of(apart)[0] <= farthest:

@@ -113,6 +113,8 @@ def test_config_reproduces_the_settings(preset: str) -> None:
 
 OFF = {
     "augment.frames_within_s": 0.0,
+    "augment.force_weight": 0.0,
+    "augment.force_steps": 60,
     "augment.rotation_share": 0.25,
     "augment.rectangles": 1,
     "encoder.photometric": "none",

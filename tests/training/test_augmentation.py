@@ -16,7 +16,10 @@ from hjepa_cli.core.training.batches import TrajectoryBatch
 from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
 
-KEPT = ("strength", "steps", "learning_rate", "share", "rotation_share", "rectangles")
+KEPT = (
+    *("strength", "steps", "learning_rate", "share", "rotation_share", "rectangles"),
+    *("force_weight", "force_steps"),
+)
 OFF = {field.name: 0.0 for field in dataclasses.fields(AugmentSettings) if field.name not in KEPT}
 COUNT = 400
 
@@ -204,7 +207,8 @@ def test_a_jepa_sees_clean_pictures_only() -> None:
 
 def test_what_is_hardened_sees_worse_pictures_than_its_teacher() -> None:
     encoder = Seen(16, "difference", centre=False)
-    hardening = Hardening(torch.nn.ModuleDict({"encoder": encoder}), torch.device("cpu"))
+    clean = AugmentSettings(force_weight=0.0)
+    hardening = Hardening(torch.nn.ModuleDict({"encoder": encoder}), torch.device("cpu"), clean, 4)
     hardening.train()
     batch = worse_batch()
     hardening.losses(batch)

@@ -29,6 +29,7 @@ from hjepa_cli.stages.training import untrained
 from hjepa_cli.storage.checkpoints import load_checkpoint
 
 QUIET, CPU = Screen(quiet=True), torch.device("cpu")
+PLANNED = AugmentSettings(force_steps=12)
 TINY = {
     "device": "cpu",
     "collect.trajectories": 3,
@@ -78,7 +79,7 @@ def learned() -> nn.ModuleDict:
     """An encoder and its companion, with statistics of some pictures."""
     torch.manual_seed(0)
     options = settings()
-    modules = untrained(train_encoder.describe_architecture(options), options)
+    modules = untrained(train_hierarchy.describe_architecture(options), options)
     encoder: Any = modules["encoder"]
     frames = pictures(24)
     encoder.fit_standardisation(frames)
@@ -117,7 +118,7 @@ def hardened(hardening: Hardening, batch: TrajectoryBatch, steps: int) -> list[f
     for step in range(steps):
         hardening.train()
         terms = hardening.losses(batch)
-        assert set(terms) == {"hardening"}
+        assert set(terms) == {"hardening", "force"}
         losses.append(optimiser.step(hardening.total(terms), step))
         hardening.after_step()
     return losses
@@ -126,7 +127,7 @@ def hardened(hardening: Hardening, batch: TrajectoryBatch, steps: int) -> list[f
 def test_it_begins_with_what_was_learned(networks: nn.ModuleDict, batch: TrajectoryBatch) -> None:
     """Clean pictures are seen as before the first step, and there is nothing to learn of them."""
     before = networks["encoder"](batch.frames)
-    hardening = Hardening(networks, CPU)
+    hardening = Hardening(networks, CPU, PLANNED, 4)
     hardening.train()
     assert hardening.networks["encoder"] is networks["encoder"]
     for name in ("encoder", "teacher"):
@@ -141,7 +142,7 @@ def test_weights_of_the_encoder_change_and_nothing_else(
     networks: nn.ModuleDict, batch: TrajectoryBatch
 ) -> None:
     """Neither the teacher, nor other networks, nor any statistics of a batch norm."""
-    hardening = Hardening(networks, CPU)
+    hardening = Hardening(networks, CPU, PLANNED, 4)
     before = copied(hardening.networks)
     hardened(hardening, batch, 3)
     after = hardening.networks.state_dict()
@@ -160,7 +161,7 @@ def test_weights_of_the_encoder_change_and_nothing_else(
 
 def test_it_learns(networks: nn.ModuleDict, batch: TrajectoryBatch) -> None:
     """Worse pictures get closer to clean ones, of which the embeddings hardly move."""
-    losses = hardened(Hardening(networks, CPU), batch, 15)
+    losses = hardened(Hardening(networks, CPU, PLANNED, 4), batch, 15)
     assert min(losses[-3:]) < 0.6 * losses[0], losses
 
 

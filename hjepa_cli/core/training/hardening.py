@@ -7,14 +7,20 @@ teacher here: the encoder goes on from it, and its embedding of a worse picture 
 teacher's of the clean one. The teacher's frames lie close together, which makes embeddings that
 levels predict well; those of the encoder lie further apart from here on, where noise moves them
 less than a pole that falls.
+
+To the cosine all that a picture shows is alike, and a camera that is turned by two degrees changes
+little of it. What counts are the forces of the gap that follows: those that actor and levels plan
+from both embeddings are to be the same, too.
 """
 
 import copy
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from hjepa_cli.config.schema import Look
+from hjepa_cli.config.schema import AugmentSettings, Look
+from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.training.batches import TrajectoryBatch
 from hjepa_cli.core.training.frame_policies import Phase
@@ -22,11 +28,19 @@ from hjepa_cli.core.training.losses import cosine_loss
 
 
 class Hardening(Phase):
-    """It trains the ``encoder`` of ``networks`` on worse pictures; the others stay as they are."""
+    """It trains the ``encoder`` of ``networks`` on worse pictures; the others stay as they are.
 
-    def __init__(self, networks: nn.ModuleDict, device: torch.device) -> None:
+    Forces are planned as ``settings`` say, one for every ``stride`` of the coarsest level.
+    """
+
+    def __init__(
+        self, networks: nn.ModuleDict, device: torch.device, settings: AugmentSettings, stride: int
+    ) -> None:
         teacher = copy.deepcopy(networks["encoder"])
         super().__init__(nn.ModuleDict({**networks, "teacher": teacher}), ("encoder",), device)
+        self.weight, self.stride = settings.force_weight, stride
+        self.strides = max(settings.force_steps // stride, 1)
+        self.level = "high" if "high" in networks else "flat"
 
     def look_elsewhere(self, look: Look, sample: Tensor) -> None:
         """Let the encoder see frames of another look, and the teacher those that it knows.
@@ -45,8 +59,32 @@ class Hardening(Phase):
         self.networks.eval()
 
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
-        """Return 1 − cos(Ψ(worse), Ψ_teacher(clean)) of frames [B · F, κ, H, W, C]."""
+        """Return what frames [B · F, κ, H, W, C] are to be alike in, if they are worse.
+
+        ``hardening`` is 1 − cos(Ψ(worse), Ψ_teacher(clean)), ``force`` the squared error of the
+        forces planned from there, in units of the force limit squared.
+        """
         with torch.no_grad():
             target = self.networks["teacher"](batch.aimed_at.to(self.device))
         z = self.networks["encoder"](batch.seen.to(self.device))
-        return {"hardening": cosine_loss(z, target)}
+        terms = {"hardening": cosine_loss(z, target)}
+        if self.weight:
+            with torch.no_grad():
+                wanted = self.plan(target)
+            terms["force"] = F.mse_loss(self.plan(z), wanted)
+        return terms
+
+    def plan(self, z: Tensor) -> Tensor:
+        """Plan forces ÷ force limit [strides, N, *A] from embeddings [N, D], held for a stride."""
+        actor, coarsest = (self.networks[name] for name in ("actor", self.level))
+        assert isinstance(actor, Actor)
+        forces: list[Tensor] = []
+        for _ in range(self.strides):
+            if forces:
+                z = coarsest(z, forces[-1][:, None].repeat_interleave(self.stride, 1))
+            forces.append(actor.act(z))
+        return torch.stack(forces).float()
+
+    def total(self, terms: dict[str, Tensor]) -> Tensor:
+        """Return what is minimised."""
+        return terms["hardening"] + self.weight * terms.get("force", 0.0)
