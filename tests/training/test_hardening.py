@@ -14,7 +14,9 @@ from hjepa_cli.config.schema import AugmentSettings, Settings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.datasets.dataset import load_dataset
 from hjepa_cli.core.networks import health
+from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.model import LEVELS, load_modules
+from hjepa_cli.core.networks.predictors import Predictor
 from hjepa_cli.core.plants.named import Camera, plant_of
 from hjepa_cli.core.training.augmentation import Augmentation
 from hjepa_cli.core.training.batches import FrameWindows, TrajectoryBatch
@@ -157,6 +159,80 @@ def test_weights_of_the_encoder_change_and_nothing_else(
     assert not any(module.training for module in hardening.networks.modules())
     (part,) = hardening.parts().values()
     assert part.state_dict().keys() == before.keys(), "and all of it is saved"
+
+
+def test_forces_are_planned_from_both_embeddings(
+    networks: nn.ModuleDict, batch: TrajectoryBatch
+) -> None:
+    """As a controller plans them: the actor's clipped force, held for a stride, then P^H's next."""
+    actor: Any = networks["actor"]
+    for linear in (actor.layers[0], actor.layers[3]):
+        nn.init.normal_(linear.odd.weight, std=1.0)
+    nn.init.normal_(actor.layers[-1].odd.weight, std=2.0)  # some forces are clipped, others not
+    nn.init.normal_(networks["high"].output.even.weight, std=0.2)
+    hardening = Hardening(networks, CPU, PLANNED, 4)
+    hardening.train()
+    seen = networks["encoder"](batch.worse), hardening.networks["teacher"](batch.frames)
+    errors, clipped = [], 0
+    for row in zip(*(z.detach() for z in seen), strict=True):
+        planned = []
+        for z in row:
+            forces = []
+            for _ in range(3):  # 12 steps of strides of 4
+                force = max(-1.0, min(1.0, float(actor(z[None]))))
+                clipped += abs(force) == 1.0
+                forces.append(force)
+                z = networks["high"](z[None], torch.full((1, 4), force))[0]
+            planned.append(forces)
+        errors += [(a - b) ** 2 for a, b in zip(*planned, strict=True)]
+    assert 0 < clipped < 2 * len(errors)
+    terms = hardening.losses(batch)
+    assert float(terms["force"].detach()) == pytest.approx(sum(errors) / len(errors), rel=1e-4)
+    total = float(terms["hardening"].detach()) + 0.1 * float(terms["force"].detach())
+    assert float(hardening.total(terms).detach()) == pytest.approx(total, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(), (2,)], ids=str)
+@pytest.mark.parametrize("level", ["high", "flat"])
+def test_plans_of_any_plant_and_of_one_level(shape: tuple[int, ...], level: str) -> None:
+    """A model of stride 1 has no P^H; several forces are held together."""
+    count = 2 if shape else 1
+    stride = 4 if level == "high" else 1
+    networks = nn.ModuleDict(
+        {
+            "encoder": nn.Identity(),
+            "actor": Actor(16, 8, 0.2, shape).eval(),
+            level: Predictor(16, 8, stride * count),
+        }
+    )
+    hardening = Hardening(networks, CPU, PLANNED, stride)
+    z = torch.randn(3, 16)
+    forces = hardening.plan(z)
+    assert forces.shape == (12 // stride, 3, *shape)
+    assert torch.equal(forces[0], networks["actor"].act(z))
+    after = networks[level](z, torch.stack([forces[0]] * stride, dim=1))
+    assert torch.allclose(forces[1], networks["actor"].act(after))
+
+
+def test_forces_get_closer(networks: nn.ModuleDict, batch: TrajectoryBatch) -> None:
+    """Their error is minimised; without a weight no forces are planned, and no actor is needed."""
+    nn.init.normal_(networks["actor"].layers[-1].odd.weight, std=0.5)
+    settings = dataclasses.replace(PLANNED, force_weight=20.0)
+    hardening = Hardening(networks, CPU, settings, 4)
+
+    def error() -> float:
+        with torch.no_grad():
+            return float(hardening.losses(batch)["force"])
+
+    hardening.train()
+    before = error()
+    hardened(hardening, batch, 15)
+    assert error() < 0.5 * before
+    off = Hardening(
+        nn.ModuleDict({"encoder": networks["encoder"]}), CPU,
+        dataclasses.replace(PLANNED, force_weight=0.0), 4,
+    )  # fmt: skip
+    assert off.losses(batch).keys() == {"hardening"}
 
 
 def test_it_learns(networks: nn.ModuleDict, batch: TrajectoryBatch) -> None:
