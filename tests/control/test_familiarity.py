@@ -124,6 +124,7 @@ def measured(model, condition: str, **changes: float):
 def test_garbage_is_flagged_and_ordinary_packets_are_not(model) -> None:
     nominal = measured(model, "")
     assert nominal.flagged.mean() < 0.03 and nominal.score.mean() > 0.8
+    gained = {}
     for fault in ("black", "saturated", "torn", "frozen"):
         found = measured(model, f"{fault}=0.3")
         # Of 6 × 50 packets 30 % ± 4 σ, and the false alarms.
@@ -131,7 +132,9 @@ def test_garbage_is_flagged_and_ordinary_packets_are_not(model) -> None:
         acted_on = measured(model, f"{fault}=0.3", **{"protocol.false_alarm": 0.0})
         assert acted_on.flagged is None
         assert found.score.mean() > 0.85 * nominal.score.mean()
-        assert found.score.mean() > acted_on.score.mean(), fault
+        gained[fault] = found.score.mean() - acted_on.score.mean()
+    # Without anything to see, black or white, the model plans hardly any force: no loss either way.
+    assert min(gained.values()) > -0.03 and gained["torn"] > 0.3 and gained["frozen"] > 0, gained
 
 
 def test_off_no_coder_is_fitted(model, monkeypatch) -> None:
