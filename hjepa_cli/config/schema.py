@@ -244,14 +244,17 @@ class AugmentSettings:
     From then on its frames lie i² · ``encoder.frame_gap`` steps back instead of i, where that is
     ``frames_within_s`` at most: a velocity of one step, and others that noise spares. Embeddings
     that are of such frames from the beginning are harder to predict (docs/LOG.md).
+
+    The forces of ``force_steps`` that are planned from a worse picture are to be those of the clean
+    one: their squared error counts ``force_weight`` times beside 1 − cos of the embeddings.
     """
 
     strength: NotNegative = 1.0
     steps: Count = 1500
     learning_rate: NotNegative = 7e-4
     frames_within_s: NotNegative = 0.01  # 0 leaves them where they are
-    force_weight: NotNegative = 0.1  # of planned forces' squared error beside 1 − cos
-    force_steps: Count = 60  # that are planned from a picture
+    force_weight: NotNegative = 0.1  # 0 plans none
+    force_steps: Count = 60
     clean: Annotated[float, Meta(ge=0, le=1)] = 0.3  # share of pictures that stay as they are
     share: Annotated[float, Meta(ge=0, le=1)] = 0.35  # of the others, for each effect by itself
     rotation_share: Annotated[float, Meta(ge=0, le=1)] = 0.6  # it is the hardest to see through
@@ -292,8 +295,7 @@ class HierarchySettings:
     l: Annotated[Count, Flag("--l", "Stride of the low level.")] = 1
     # Of the pictures, sideways by up to encoder.shift_px, for actor and levels.
     shifted_copies: CountOrNone = 2
-    # In longer ones forces tell what pictures did not, and levels follow their own actor's later.
-    rollout_steps: Count = 80
+    rollout_steps: Count = 80  # longer ones predict worse in closed loops (docs/LOG.md)
     batch_trajectories: Count = 16
     coarse_starts: Count = 8
     flat_starts: Count = 2

@@ -26,7 +26,7 @@ from hjepa_cli.core.datasets.dataset import Dataset
 from hjepa_cli.core.datasets.trajectories import driven_by_teacher
 from hjepa_cli.core.networks import health
 from hjepa_cli.core.networks.encoder import Encoder
-from hjepa_cli.core.networks.model import LEVELS, UNSAID, levels_of, load_modules
+from hjepa_cli.core.networks.model import LEVELS, UNSAID, coarsest_of, levels_of, load_modules
 from hjepa_cli.core.plants.frames import remembers_from
 from hjepa_cli.core.plants.named import plant_of
 from hjepa_cli.core.training import levels
@@ -229,7 +229,7 @@ def harden(
         train,
         "hardening",
         hardening,
-        lambda terms: {"level": "hardening", "loss": terms["hardening"]},
+        lambda terms: {"level": "hardening", "loss": sum(terms.values())},
         looks=(encoder.look, clean_look),
         steps=augment.steps,
         learning_rate=augment.learning_rate,
@@ -335,7 +335,7 @@ def examine(
     """
     kind = plant_of(settings)
     train_z, z = (embed(modules["encoder"], split, settings) for split in (train, test))
-    names = ("actor", "high" if "high" in modules else "flat")
+    names = ("actor", coarsest_of(modules))
     actor, coarsest = (copy.deepcopy(modules[name]).cpu().eval() for name in names)
     start, end = z[:, :-h].flatten(0, 1), z[:, h:].flatten(0, 1)
     return {

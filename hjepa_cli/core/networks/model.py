@@ -150,6 +150,11 @@ def levels_of(architecture: Mapping[str, Any]) -> tuple[str, ...]:
     return levels[1:] if (architecture["kind"], architecture["h"]) == ("flat", 1) else levels
 
 
+def coarsest_of(modules: nn.ModuleDict) -> str:
+    """Name the level with the longest stride: P^H, or the only one of a flat model of stride 1."""
+    return "high" if "high" in modules else "flat"
+
+
 def load_modules(checkpoint: Checkpoint) -> nn.ModuleDict:
     """Rebuild the networks of a checkpoint, with strict names, shapes and dtypes.
 

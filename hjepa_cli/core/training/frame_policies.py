@@ -17,7 +17,7 @@ from hjepa_cli.core.training.batches import TrajectoryBatch
 
 
 class Phase:
-    """One term is minimised by some of the networks, ``trained``; the others stay as they are."""
+    """The sum of terms is minimised by some networks, ``trained``; the others stay as they are."""
 
     def __init__(
         self, networks: nn.ModuleDict, trained: tuple[str, ...], device: torch.device
@@ -25,9 +25,8 @@ class Phase:
         self.networks, self.trained, self.device = networks.to(device), trained, device
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """Return the only term."""
-        (term,) = terms.values()
-        return term
+        """Return the sum of terms."""
+        return torch.stack([*terms.values()]).sum()
 
     def train(self) -> None:
         """Put what learns into training mode."""

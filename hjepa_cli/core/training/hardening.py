@@ -8,8 +8,8 @@ teacher's of the clean one. The teacher's frames lie close together, which makes
 levels predict well; those of the encoder lie further apart from here on, where noise moves them
 less than a pole that falls.
 
-To the cosine all that a picture shows is alike, and a camera that is turned by two degrees changes
-little of it. What counts are the forces of the gap that follows: those that actor and levels plan
+The cosine weighs all of an embedding alike, and a camera that is turned by two degrees changes
+little of it. What counts is the gap that follows: the forces that actor and coarsest level plan
 from both embeddings are to be the same, too.
 """
 
@@ -22,6 +22,7 @@ from torch.nn import functional as F
 from hjepa_cli.config.schema import AugmentSettings, Look
 from hjepa_cli.core.networks.actor import Actor
 from hjepa_cli.core.networks.encoder import Encoder
+from hjepa_cli.core.networks.model import coarsest_of
 from hjepa_cli.core.training.batches import TrajectoryBatch
 from hjepa_cli.core.training.frame_policies import Phase
 from hjepa_cli.core.training.losses import cosine_loss
@@ -40,7 +41,6 @@ class Hardening(Phase):
         super().__init__(nn.ModuleDict({**networks, "teacher": teacher}), ("encoder",), device)
         self.weight, self.stride = settings.force_weight, stride
         self.strides = max(settings.force_steps // stride, 1)
-        self.level = "high" if "high" in networks else "flat"
 
     def look_elsewhere(self, look: Look, sample: Tensor) -> None:
         """Let the encoder see frames of another look, and the teacher those that it knows.
@@ -61,8 +61,8 @@ class Hardening(Phase):
     def losses(self, batch: TrajectoryBatch) -> dict[str, Tensor]:
         """Return what frames [B · F, κ, H, W, C] are to be alike in, if they are worse.
 
-        ``hardening`` is 1 − cos(Ψ(worse), Ψ_teacher(clean)), ``force`` the squared error of the
-        forces planned from there, in units of the force limit squared.
+        ``hardening`` is 1 − cos(Ψ(worse), Ψ_teacher(clean)), ``force`` the weighted squared error
+        of the forces planned from there, ÷ force limit squared.
         """
         with torch.no_grad():
             target = self.networks["teacher"](batch.aimed_at.to(self.device))
@@ -71,12 +71,12 @@ class Hardening(Phase):
         if self.weight:
             with torch.no_grad():
                 wanted = self.plan(target)
-            terms["force"] = F.mse_loss(self.plan(z), wanted)
+            terms["force"] = self.weight * F.mse_loss(self.plan(z), wanted)
         return terms
 
     def plan(self, z: Tensor) -> Tensor:
         """Plan forces ÷ force limit [strides, N, *A] from embeddings [N, D], held for a stride."""
-        actor, coarsest = (self.networks[name] for name in ("actor", self.level))
+        actor, coarsest = (self.networks[name] for name in ("actor", coarsest_of(self.networks)))
         assert isinstance(actor, Actor)
         forces: list[Tensor] = []
         for _ in range(self.strides):
@@ -84,7 +84,3 @@ class Hardening(Phase):
                 z = coarsest(z, forces[-1][:, None].repeat_interleave(self.stride, 1))
             forces.append(actor.act(z))
         return torch.stack(forces).float()
-
-    def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """Return what is minimised."""
-        return terms["hardening"] + self.weight * terms.get("force", 0.0)
