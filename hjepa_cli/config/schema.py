@@ -253,11 +253,11 @@ class AugmentSettings:
     steps: Count = 1500
     learning_rate: NotNegative = 7e-4
     frames_within_s: NotNegative = 0.01  # 0 leaves them where they are
-    force_weight: NotNegative = 0.1  # 0 plans none
+    force_weight: NotNegative = 0.2  # 0 plans none
     force_steps: Count = 60
     clean: Annotated[float, Meta(ge=0, le=1)] = 0.3  # share of pictures that stay as they are
     share: Annotated[float, Meta(ge=0, le=1)] = 0.35  # of the others, for each effect by itself
-    rotation_share: Annotated[float, Meta(ge=0, le=1)] = 0.6  # it is the hardest to see through
+    rotation_share: Annotated[float, Meta(ge=0, le=1)] = 0.85  # it is the hardest to see through
     gain: BelowOne = 0.35  # ± of 1
     gamma: NotNegative = 0.3  # exponents from 1/(1 + this) to 1 + this
     colour: BelowOne = 0.1  # ± of each channel
@@ -268,6 +268,7 @@ class AugmentSettings:
     blur_px: NotNegative = 1.75  # standard deviation
     jitter_px: NotNegative = 0.12  # standard deviation, anew in every frame
     rotation_deg: NotNegative = 4.0
+    shift_down_px: NotNegative = 5.0  # or up; 0 takes no draw
     rectangles: Count = 3  # at most
     rectangle_px: NotNegative = 16.0  # side, of any grey
 
@@ -452,6 +453,7 @@ UNSAID: dict[str, Any] = {
     "augment.frames_within_s": 0.0,
     "augment.force_weight": 0.0,
     "augment.force_steps": 60,
+    "augment.shift_down_px": 0.0,
     "augment.rotation_share": 0.25,
     "augment.rectangles": 1,
     "conditions.stress": "",

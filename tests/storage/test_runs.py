@@ -115,6 +115,7 @@ OFF = {
     "augment.frames_within_s": 0.0,
     "augment.force_weight": 0.0,
     "augment.force_steps": 60,
+    "augment.shift_down_px": 0.0,
     "augment.rotation_share": 0.25,
     "augment.rectangles": 1,
     "encoder.photometric": "none",

@@ -11,7 +11,7 @@ from hjepa_cli.config.schema import AugmentSettings
 from hjepa_cli.config.settings import load_settings
 from hjepa_cli.core.networks.encoder import Encoder
 from hjepa_cli.core.networks.predictors import Predictor
-from hjepa_cli.core.training.augmentation import Augmentation
+from hjepa_cli.core.training.augmentation import SHIFTED_DOWN, Augmentation
 from hjepa_cli.core.training.batches import TrajectoryBatch
 from hjepa_cli.core.training.hardening import Hardening
 from hjepa_cli.core.training.jepa import Jepa
@@ -119,6 +119,19 @@ def test_places_move_as_far_as_they_should() -> None:
     torch.testing.assert_close(along**2 + down**2, torch.ones_like(along), atol=0.03, rtol=0)
     rows_along = turned[..., 1].diff(dim=3).mean((2, 3)) / 2
     torch.testing.assert_close(rows_along, -down, atol=0.06, rtol=0)  # of whole grey levels
+
+
+def test_some_pictures_move_up_or_down_and_none_to_a_side() -> None:
+    seen = augmented(ramp(), shift_down_px=6.0)[:, :, 32, 64, :2]
+    columns, rows = seen[..., 0], seen[..., 1] / 2
+    assert (columns == 64).all()
+    assert (rows[:, 0] == rows[:, 1]).all(), "all frames of an input alike"
+    down_px = 32 - rows[:, 0]
+    moved = down_px[down_px.abs() > 0.25]  # grey levels are half a pixel
+    share = SHIFTED_DOWN * 5.75 / 6
+    assert abs(len(moved) / COUNT - share) < 4 * (share / COUNT) ** 0.5
+    assert moved.abs().max() <= 6.25 and moved.max() > 4 and moved.min() < -4
+    assert abs(moved.mean()) < 4 * (12 / 12**0.5) / len(moved) ** 0.5
 
 
 def test_jitter_and_rotation_are_drawn_for_themselves() -> None:

@@ -187,9 +187,8 @@ def test_forces_are_planned_from_both_embeddings(
         errors += [(a - b) ** 2 for a, b in zip(*planned, strict=True)]
     assert 0 < clipped < 2 * len(errors)
     terms = hardening.losses(batch)
-    assert float(terms["force"].detach()) == pytest.approx(
-        0.1 * sum(errors) / len(errors), rel=1e-4
-    )
+    expected = PLANNED.force_weight * sum(errors) / len(errors)
+    assert float(terms["force"].detach()) == pytest.approx(expected, rel=1e-4)
     total = float(terms["hardening"].detach()) + float(terms["force"].detach())
     assert float(hardening.total(terms).detach()) == pytest.approx(total, rel=1e-6)
 

@@ -3,11 +3,11 @@
 What a network is asked for does not change with the light, the noise or a thing in a corner, so
 only what it looks at is augmented (as in SVEA and SADA, and unlike training pictures that vary for
 targets too, from which a world model would have to predict the light). The frames of one input
-share what is slow: light, colour, rotation, blur, a rectangle. Noise, jitter and flicker are drawn
-for each: they are what drowns a velocity.
+share what is slow: light, colour, rotation, height, blur, a rectangle. Noise, jitter and flicker
+are drawn for each: they are what drowns a velocity.
 
-Left out, so that there is something to test on: JPEG, shifts, lenses, stains, vignettes, dead
-pixels, bars and hidden edges, contrast and brightness.
+Left out, so that there is something to test on: JPEG, shifts to a side, lenses, stains, vignettes,
+dead pixels, bars and hidden edges, contrast and brightness.
 """
 
 import math
@@ -22,6 +22,7 @@ from hjepa_cli.config.schema import AugmentSettings
 MOST_SEED = 2**62
 BLUR_REACH = 2.5  # standard deviations that a blur is cut off at
 FARTHEST_BLUR_PX = 8.0
+SHIFTED_DOWN = 0.15  # share of pictures; with more, turned ones are not learned (docs/LOG.md)
 NOISE_INPUTS = 4  # whose noise is drawn for a window
 NUMBERS = 40  # uniform ones that an input takes at most, besides noise and jitter …
 OF_RECTANGLE = 6  # … and those of the rectangles after the first
@@ -78,11 +79,17 @@ class Augmentation:
             worse.copy_(pictures.round_().clamp_(0, 255))
 
     def _moved(self, pictures: Tensor, moves_px: Tensor, draws: "_Draws") -> Tensor:
-        """Turn pictures [κ, H, W, C] around their middle, and move each by parts of a pixel."""
+        """Turn pictures [κ, H, W, C] around their middle, and move them up or down.
+
+        Each moves by parts of a pixel besides.
+        """
         turned = draws.chosen(self._of.rotation_share)
         angle = math.radians(draws.both_ways(self._of.rotation_deg, turned))
         jitter_px = draws.most(self._of.jitter_px) * draws.chosen()
-        if not (angle or jitter_px):
+        down_px = 0.0
+        if self._of.shift_down_px:  # no number is drawn for what is off
+            down_px = draws.both_ways(self._of.shift_down_px, draws.chosen(SHIFTED_DOWN))
+        if not (angle or jitter_px or down_px):
             return pictures
         height, width = pictures.shape[1:3]
         # Places count from the middle of the picture, which is 2 wide and 2 high for grid_sample.
@@ -91,7 +98,8 @@ class Augmentation:
         right = cos * columns[None] - sin * rows[:, None]
         down = sin * columns[None] + cos * rows[:, None]
         places = torch.stack([right * (2 / width), down * (2 / height)], dim=-1)
-        moves = jitter_px * moves_px * torch.tensor([2 / width, 2 / height])
+        moves = jitter_px * moves_px - torch.tensor([0.0, down_px])
+        moves = moves * torch.tensor([2 / width, 2 / height])
         grid = (places + moves[:, None, None]).to(pictures.device)
         seen = pictures.permute(0, 3, 1, 2)
         warped = F.grid_sample(seen, grid, padding_mode="border", align_corners=False)
