@@ -268,7 +268,7 @@ class AugmentSettings:
     blur_px: NotNegative = 1.75  # standard deviation
     jitter_px: NotNegative = 0.12  # standard deviation, anew in every frame
     rotation_deg: NotNegative = 4.0
-    shift_down_px: NotNegative = 5.0  # or up; 0 takes no draw
+    shift_down_px: NotNegative = 5.0  # or up, of few pictures; 0 takes no draw
     rectangles: Count = 3  # at most
     rectangle_px: NotNegative = 16.0  # side, of any grey
 
